@@ -1,0 +1,254 @@
+"""Images and messages into a new rosbag2 folder: for the simulator and the recorder."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from rosbags.interfaces import (
+    Connection,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer, WriterError
+from rosbags.typesys import Stores, TypesysError, get_typestore
+
+from ofsat_ros.images import EncodingError, decode_image, encode_png
+from ofsat_ros.recordings.bag import COMPRESSED_IMAGE, IMAGE, SUFFIXES, RecordingError
+
+_NS = 1_000_000_000
+_STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
+_COMPRESSIONS = {
+    "none": CompressionMode.NONE,
+    "message": CompressionMode.MESSAGE,
+    "file": CompressionMode.FILE,
+    "chunk": CompressionMode.STORAGE,
+}
+# What image publishers offer: any subscriber can have it, and nothing is kept for late ones.
+_FOREVER = QosTime(9223372036, 854775807)
+_QOS = Qos(
+    QosHistory.KEEP_LAST,
+    10,
+    QosReliability.RELIABLE,
+    QosDurability.VOLATILE,
+    deadline=_FOREVER,
+    lifespan=_FOREVER,
+    liveliness=QosLiveliness.AUTOMATIC,
+    liveliness_lease_duration=_FOREVER,
+    avoid_ros_namespace_conventions=False,
+)
+
+
+class BagWriter:
+    """Writes a rosbag2 folder; a context manager.
+
+    The bag is closed, and so is readable, also when an exception or Ctrl-C ends the ``with``.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder to make.
+    storage : {"mcap", "sqlite3"}
+    compression : {"none", "message", "file", "chunk"}
+        What zstd compresses; chunk is for MCAP only.
+    force : bool
+        Replace a bag that exists at `path`; anything else there is never removed.
+
+    Raises
+    ------
+    RecordingError
+        If something exists at `path`, or it cannot be made, or an argument is not one of these.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        storage: str = "mcap",
+        compression: str = "none",
+        force: bool = False,
+    ) -> None:
+        self.path = Path(path)
+        plugin = _pick(storage, _STORAGES, "storage")
+        mode = _pick(compression, _COMPRESSIONS, "compression")
+        if (storage, compression) == ("sqlite3", "chunk"):
+            raise RecordingError(
+                "only mcap is compressed by chunk: use message or file for sqlite3"
+            )
+        if self.path.exists() or self.path.is_symlink():
+            _make_way(self.path, force)
+        self._typestore = get_typestore(Stores.ROS2_JAZZY)
+        self._connections: dict[str, Connection] = {}
+        try:
+            self._writer: Writer | None = Writer(self.path, version=9, storage_plugin=plugin)
+            self._writer.set_compression(mode, CompressionFormat.ZSTD)
+            self._writer.open()
+        except (OSError, WriterError) as error:
+            raise RecordingError(f"cannot write {self.path}: {error}") from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Finish the files; a second call does nothing."""
+        writer, self._writer = self._writer, None
+        if writer is None:
+            return
+        try:
+            writer.close()
+        except (OSError, sqlite3.Error) as error:
+            raise RecordingError(f"cannot finish {self.path}: {error}") from error
+
+    def write(self, topic: str, msgtype: str, data: bytes | memoryview, stamp_ns: int) -> None:
+        """Write a serialized message.
+
+        Parameters
+        ----------
+        topic : str
+        msgtype : str
+            As ``sensor_msgs/msg/Image``; the same for every message of a topic.
+        data : bytes or memoryview
+            CDR, as received.
+        stamp_ns : int
+            Time at which it was received, ns.
+
+        Raises
+        ------
+        RecordingError
+            If the type is unknown or not the topic's, or the bag is closed, or the disk is full.
+        """
+        if self._writer is None:
+            raise RecordingError(f"{self.path} is closed: nothing more can be written to it")
+        if not 0 <= stamp_ns < 2**63:  # or the index could not be written at the end
+            raise RecordingError(f"{topic}: a bag cannot hold the time {stamp_ns} ns")
+        try:
+            connection = self._connections.get(topic)
+            if connection is None:
+                connection = self._writer.add_connection(
+                    topic, msgtype, typestore=self._typestore, offered_qos_profiles=[_QOS]
+                )
+                self._connections[topic] = connection
+            if connection.msgtype != msgtype:
+                raise RecordingError(f"{topic} holds {connection.msgtype}, not {msgtype}")
+            self._writer.write(connection, int(stamp_ns), data)
+        except TypesysError as error:
+            raise RecordingError(f"{msgtype} is no message type known here: {error}") from error
+        except (OSError, sqlite3.Error) as error:
+            raise RecordingError(f"cannot write {self.path}: {error}") from error
+
+    def write_image(
+        self,
+        topic: str,
+        image: np.ndarray,
+        stamp_ns: int,
+        frame_id: str,
+        encoding: str | None = None,
+        compressed: bool = False,
+    ) -> None:
+        """Write an image.
+
+        Parameters
+        ----------
+        topic : str
+        image : ndarray, shape (height, width) or (height, width, 3)
+            uint8, uint16 or float32; three channels are uint8 blue, green, red.
+        stamp_ns : int
+            Stamp of the header, and time received, ns.
+        frame_id : str
+            Coordinate frame.
+        encoding : str, optional
+            Name of the encoding if it is not mono8, mono16, 32FC1 or bgr8.
+        compressed : bool
+            Write PNG in a CompressedImage.
+
+        Raises
+        ------
+        RecordingError
+            As `write`, or if no encoding fits the array.
+        """
+        types = self._typestore.types
+        sec, nanosec = divmod(int(stamp_ns), _NS)
+        if not 0 <= sec < 2**31:
+            raise RecordingError(f"{topic}: a header cannot hold the stamp {stamp_ns} ns")
+        stamp = types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
+        header = types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame_id)
+        name = encoding or _encoding_of(image)
+        fields = _png_fields(image, name) if compressed else _raw_fields(image, name)
+        msgtype = COMPRESSED_IMAGE if compressed else IMAGE
+        message = types[msgtype](header=header, **fields)
+        self.write(topic, msgtype, self._typestore.serialize_cdr(message, msgtype), stamp_ns)
+
+
+def _pick(word: str, known: dict[str, Any], what: str) -> Any:
+    if word not in known:
+        raise RecordingError(f"{what} must be one of {', '.join(known)}, not {word!r}")
+    return known[word]
+
+
+def _make_way(path: Path, force: bool) -> None:
+    """Remove a bag, or say why not."""
+    if not force:
+        raise RecordingError(f"{path} exists: choose another path, or force to replace a bag")
+    bag = path.is_dir() and not path.is_symlink() and (path / "metadata.yaml").exists()
+    inside = sorted(path.iterdir()) if bag else []
+    foreign = [f.name for f in inside if not (f.name == "metadata.yaml" or _is_storage(f))]
+    if not bag or foreign:
+        why = f"it also holds {', '.join(foreign)}" if foreign else "it is no bag"
+        raise RecordingError(f"{path} is not replaced, since {why}: remove it yourself")
+    for file in inside:
+        file.unlink()
+    path.rmdir()
+
+
+def _is_storage(path: Path) -> bool:
+    return path.is_file() and any(suffix in SUFFIXES for suffix in path.suffixes)
+
+
+def _encoding_of(image: np.ndarray) -> str:
+    name = {
+        (2, "uint8"): "mono8",
+        (2, "uint16"): "mono16",
+        (2, "float32"): "32FC1",
+        (3, "uint8"): "bgr8",
+    }.get((image.ndim, image.dtype.name))
+    if name is None or 0 in image.shape or image.shape[2:] not in ((), (3,)):
+        raise RecordingError(f"no encoding for an {image.dtype} image of shape {image.shape}")
+    return name
+
+
+def _raw_fields(image: np.ndarray, encoding: str) -> dict[str, Any]:
+    """Return the fields of an Image, all but the header."""
+    pixels = np.ascontiguousarray(image, image.dtype.newbyteorder("<"))
+    fields = {
+        "height": image.shape[0],
+        "width": image.shape[1],
+        "encoding": encoding,
+        "is_bigendian": 0,
+        "step": pixels[0].nbytes,
+        "data": pixels.reshape(-1).view(np.uint8),
+    }
+    try:
+        holds = decode_image(**fields).dtype
+    except EncodingError as error:
+        raise RecordingError(f"{image.dtype} image of shape {image.shape}: {error}") from error
+    if holds.name != image.dtype.name:
+        raise RecordingError(f"{encoding} does not hold {image.dtype} pixels")
+    return fields
+
+
+def _png_fields(image: np.ndarray, encoding: str) -> dict[str, Any]:
+    """Return the fields of a CompressedImage, all but the header."""
+    try:
+        png = encode_png(image)
+    except EncodingError as error:
+        raise RecordingError(f"{error}") from error
+    # As image_transport's PNG publisher fills the field.
+    return {"format": f"{encoding}; png compressed ", "data": np.frombuffer(png, np.uint8)}
