@@ -1,0 +1,136 @@
+"""Objects: one measurement per connected region of the thresholded image.
+
+Second stage: takes the mask and the images of ``preprocessing``; what follows measures the flow
+of these objects.  An object is a star, an RSO or an artefact; this stage does not tell which.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+OBJECT_DTYPE = np.dtype(
+    [
+        ("x", "f8"),  # centroid, px
+        ("y", "f8"),
+        ("sigma_x", "f8"),  # std of the centroid, px
+        ("sigma_y", "f8"),
+        ("flux", "f8"),  # DN, sum over the region, background subtracted
+        ("snr", "f8"),  # matched filter
+        ("peak", "f8"),  # highest smoothed value, DN
+        ("length", "f8"),  # length of the streak, px; 0 for a round object
+        ("angle", "f8"),  # direction of the streak, rad from x to y, within (-pi/2, pi/2]
+        ("area", "i4"),  # px
+        ("edge", "?"),  # the region touches the border of the image
+    ]
+)
+
+
+def find_objects(
+    image: NDArray[np.float32],
+    smoothed: NDArray[np.float32],
+    mask: NDArray[np.uint8],
+    pixel_noise: float,
+    noise: float,
+    noise_ratio: NDArray[np.float32],
+    min_area_px: int = 1,
+    max_objects: int = 5000,
+) -> tuple[NDArray[np.void], NDArray[np.int32]]:
+    """Measure the connected regions of a mask.
+
+    Position and shape are the first and second moments of the smoothed brightness in the region.
+    A uniform line of length L adds L^2/12 to the variance along it, hence
+    L = sqrt(12 (major - minor)).  The SNR is the larger of two estimates of the matched filter's
+    sqrt(sum s_i^2 / var_i): peak over noise in the smoothed image, right for a point source, and
+    the sum over the region's pixels less what noise alone would give, right for a streak.  The
+    centroid's std is sqrt(2 moment) / SNR, the Cramer-Rao bound of a Gaussian in white noise.
+
+    Parameters
+    ----------
+    image, smoothed : (H, W) float32
+        Background-subtracted image and its smoothed version, DN.
+    mask : (H, W) uint8
+        Nonzero inside objects.
+    pixel_noise, noise : float
+        Std of the background in `image` and in `smoothed`, DN, greater than 0.
+    noise_ratio : (ny, nx) float32
+        Local noise over these, on a mesh of equal cells over the image.
+    min_area_px : int
+        Smaller regions are left out.
+    max_objects : int
+        The regions with the largest SNR are kept.
+
+    Returns
+    -------
+    objects : (N,) OBJECT_DTYPE
+        Sorted by SNR, the largest first.
+    labels : (H, W) int32
+        1 + index of the object that a pixel belongs to, 0 for none.
+    """
+    count, regions = cv2.connectedComponents(mask, connectivity=8, ltype=cv2.CV_32S)
+    inside = cv2.findNonZero(mask)
+    if inside is None:
+        return np.zeros(0, OBJECT_DTYPE), np.zeros(mask.shape, np.int32)
+    x, y = inside.reshape(-1, 2).T.astype(np.intp)
+    region = regions[y, x]
+    height, width = mask.shape
+
+    def total(weights: NDArray[np.generic] | None = None) -> NDArray[np.float64]:
+        return np.bincount(region, weights, count)[1:].astype(np.float64)
+
+    value = smoothed[y, x].astype(np.float64)
+    raw = image[y, x].astype(np.float64)
+    area = total()
+    # Every weight is positive, also where a published threshold lies below the background.
+    lowest = np.full(count, np.inf)
+    np.minimum.at(lowest, region, value)
+    weight = value - np.minimum(lowest[region], 0) + 1e-6 * noise
+    norm = total(weight)
+    cx, cy = total(weight * x) / norm, total(weight * y) / norm
+    dx, dy = x - cx[region - 1], y - cy[region - 1]
+    # A pixel is a square of side 1: its variance keeps a single pixel from having none.
+    xx = total(weight * dx * dx) / norm + 1 / 12
+    yy = total(weight * dy * dy) / norm + 1 / 12
+    xy = total(weight * dx * dy) / norm
+    peak = np.full(count, -np.inf)
+    np.maximum.at(peak, region, value)
+
+    local = _sample_mesh(noise_ratio, cx, cy, mask.shape)
+    energy = total(raw * raw) / (pixel_noise * local) ** 2 - area
+    snr = np.maximum(peak[1:] / (noise * local), np.sqrt(np.maximum(energy, 0)))
+    split = np.hypot((xx - yy) / 2, xy)
+    objects = np.zeros(count - 1, OBJECT_DTYPE)
+    objects["x"], objects["y"], objects["area"] = cx, cy, area
+    objects["flux"], objects["peak"], objects["snr"] = total(raw), peak[1:], snr
+    objects["sigma_x"], objects["sigma_y"] = (
+        np.sqrt(2 * moment) / np.maximum(snr, 1) for moment in (xx, yy)
+    )
+    # A round object's moments differ by chance: by its SNR, and by the pixel grid.
+    chance = np.maximum(0.25, 6 / np.maximum(snr, 1)) * ((xx + yy) / 2 - split)
+    objects["length"] = np.where(2 * split > chance, np.sqrt(12 * 2 * split), 0)
+    angle = np.arctan2(2 * xy, xx - yy) / 2
+    objects["angle"] = np.where(angle <= -np.pi / 2, np.pi / 2, angle)
+    at_border = (x == 0) | (y == 0) | (x == width - 1) | (y == height - 1)
+    objects["edge"] = total(at_border) > 0
+
+    order = np.flatnonzero(area >= min_area_px)
+    order = order[np.argsort(-snr[order], kind="stable")][:max_objects]
+    rank = np.zeros(count, np.int32)
+    rank[order + 1] = np.arange(1, order.size + 1)
+    labels = np.zeros(mask.shape, np.int32)
+    labels[y, x] = rank[region]
+    return objects[order], labels
+
+
+def _sample_mesh(
+    mesh: NDArray[np.float32],
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    shape: tuple[int, ...],
+) -> NDArray[np.float64]:
+    """Value of the mesh cell that each point lies in, (N,)."""
+    rows, columns = mesh.shape
+    row = np.clip(((y + 0.5) * rows / shape[0]).astype(int), 0, rows - 1)
+    column = np.clip(((x + 0.5) * columns / shape[1]).astype(int), 0, columns - 1)
+    return mesh[row, column].astype(np.float64)
