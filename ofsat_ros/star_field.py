@@ -1,0 +1,281 @@
+"""The motion of the star field: the motion that most objects share.
+
+Fourth stage: takes flow vectors and finds the one motion behind most of them; what follows asks
+which objects move otherwise.  `vote_shift` gives the flow its first guess, from the objects alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# Objects that take part in a vote: its cost is their number squared.
+_VOTERS = 150
+# Vectors among which the mode is sought that the robust fit starts from.
+_MODE_VECTORS = 400
+# A similarity has four parameters; with fewer stars than this their scatter goes into them.
+_STARS_FOR_SIMILARITY = 6
+# Cut of Tukey's biweight, in sigmas: 95 % efficiency on Gaussian errors.
+_TUKEY = 4.685
+
+
+@dataclass(frozen=True)
+class StarFieldMotion:
+    """Motion of the star field between two frames.
+
+    The displacement of a star at x is ``displacement + A (x - centre)`` with
+    ``A = [[s, -r], [r, s]]``: a small rotation r (rad, from x to y) and a scale change s.
+
+    Attributes
+    ----------
+    centre : (2,) float64
+        Centre of the image, px.
+    displacement : (2,) float64
+        Displacement of the field at the centre, px per frame.
+    rotation : float
+        rad per frame, from the x axis towards the y axis.
+    scale : float
+        Relative change of scale per frame, 0 for none.
+    covariance : (4, 4) float64
+        Of (displacement x, displacement y, scale, rotation); 0 for what was not fitted.
+    inliers : (N,) bool
+        Flow vectors that move with the field.
+    residual_px : float
+        Rms of the inliers' residuals, each axis, px.
+    residual_sigmas : float
+        Their robust std over the stated one: how much worse than stated the vectors are, >= 1.
+    speed_mean, speed_std : float
+        Of the inliers' speeds, px per frame: what the published test compares with.
+    model : str
+        What was fitted: mean, shift or similarity (fewer stars allow fewer parameters).
+    """
+
+    centre: Array
+    displacement: Array
+    rotation: float
+    scale: float
+    covariance: Array
+    inliers: NDArray[np.bool_]
+    residual_px: float
+    residual_sigmas: float
+    speed_mean: float
+    speed_std: float
+    model: str
+
+    @property
+    def star_count(self) -> int:
+        """Number of vectors that move with the field."""
+        return int(np.count_nonzero(self.inliers))
+
+    def with_inliers(self, inliers: NDArray[np.bool_]) -> StarFieldMotion:
+        """Return the same motion with the inliers of another, longer, set of vectors."""
+        return replace(self, inliers=inliers)
+
+    def displacement_at(self, xy: Array) -> Array:
+        """Displacement of the field at points (N, 2) px of the current frame, (N, 2) px."""
+        design = _design(np.asarray(xy, float) - self.centre)
+        return design @ np.array([*self.displacement, self.scale, self.rotation])
+
+    def variance_at(self, xy: Array) -> Array:
+        """Variance of `displacement_at`, (N, 2) px^2."""
+        design = _design(np.asarray(xy, float) - self.centre)
+        return np.einsum("nij,jk,nik->ni", design, self.covariance, design)
+
+
+def estimate_motion(
+    position: Array,
+    displacement: Array,
+    sigma: Array,
+    speed: Array,
+    shape: tuple[int, int],
+    model: str = "similarity",
+    outlier_sigmas: float = 2.0,
+) -> StarFieldMotion | None:
+    """Find the motion that most vectors share.
+
+    Parameters
+    ----------
+    position, displacement, sigma : (N, 2) float64
+        Valid flow vectors: end, displacement and its std, px.
+    speed : (N,) float64
+        Their speeds, px per frame.
+    shape : (height, width)
+        Size of the image, px.
+    model : {"similarity", "shift", "mean"}
+        similarity, shift: least squares with Tukey's biweight, started from the vectors' mode.
+        mean: the mean after outliers of speed are removed, as published (AAS 21-364).
+    outlier_sigmas : float
+        What the model mean removes, in std.
+
+    Returns
+    -------
+    StarFieldMotion or None
+        None if there is no vector, or no two that agree where there are more than two.
+    """
+    if not len(position):
+        return None
+    centre = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
+    if model == "mean":
+        return _mean_motion(displacement, speed, centre, outlier_sigmas)
+    inliers = _mode(displacement, sigma)
+    if len(position) > 2 and np.count_nonzero(inliers) < 2:
+        return None
+    return _robust_fit(position - centre, displacement, sigma, speed, centre, inliers, model)
+
+
+def vote_shift(
+    previous_xy: Array,
+    previous_flux: Array,
+    current_xy: Array,
+    current_flux: Array,
+    bin_px: float = 2.0,
+) -> Array | None:
+    """Shift of the field from positions and brightness alone, however far it moved.
+
+    Every pair of a bright object of the previous frame and one of the current, of similar flux,
+    votes for their displacement; true pairs vote alike, wrong ones all over the plane.
+
+    Parameters
+    ----------
+    previous_xy, current_xy : (N, 2), (M, 2) float64
+        Centroids, px.
+    previous_flux, current_flux : (N,), (M,) float64
+        Fluxes, DN.
+    bin_px : float
+        Two votes closer than this agree, px.
+
+    Returns
+    -------
+    (2,) float64 or None
+        Displacement, px per frame; None if no displacement has more votes than chance gives.
+    """
+    a, b = np.argsort(-previous_flux)[:_VOTERS], np.argsort(-current_flux)[:_VOTERS]
+    if not (a.size and b.size):
+        return None
+    shift = current_xy[b][None] - previous_xy[a][:, None]
+    ratio = (
+        np.log(np.maximum(current_flux[b], 1e-9))[None]
+        - np.log(np.maximum(previous_flux[a], 1e-9))[:, None]
+    )
+    votes = shift[np.abs(ratio) < np.log(1.5)]
+    if not len(votes):
+        return None
+    low = votes.min(axis=0)
+    cell = ((votes - low) / bin_px).astype(np.intp) + 1
+    size = cell.max(axis=0) + 2
+    counts = np.bincount(cell[:, 0] * size[1] + cell[:, 1], minlength=size[0] * size[1])
+    counts = counts.reshape(size)
+    # A peak may lie on a cell's border: count each cell with its neighbours.
+    shifts = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    near = np.sum([np.roll(counts, shift, (0, 1)) for shift in shifts], axis=0)
+    best = np.unravel_index(np.argmax(near), near.shape)
+    chance = 9 * len(votes) / max(1, int(np.count_nonzero(near)))
+    needed = 1 if min(a.size, b.size) == 1 else max(2.0, chance + 4 * np.sqrt(chance))
+    if near[best] < needed:
+        return None
+    agreeing = np.all(np.abs(cell - best) <= 1, axis=1)
+    return np.median(votes[agreeing], axis=0)
+
+
+def _mean_motion(
+    displacement: Array, speed: Array, centre: Array, outlier_sigmas: float
+) -> StarFieldMotion:
+    """Mean velocity once the outliers of speed are removed, repeatedly until none is left."""
+    inliers = np.ones(len(speed), bool)
+    for _ in range(20):
+        mean, std = speed[inliers].mean(), speed[inliers].std()
+        # the tiny slack keeps vectors that are all alike
+        kept = np.abs(speed - mean) <= outlier_sigmas * std + 1e-9
+        if not kept.any() or np.array_equal(kept, inliers):
+            break
+        inliers = kept
+    shift = displacement[inliers].mean(axis=0)
+    residual = displacement[inliers] - shift
+    covariance = np.zeros((4, 4))
+    covariance[[0, 1], [0, 1]] = residual.var(axis=0) / np.count_nonzero(inliers)
+    return StarFieldMotion(
+        centre=centre,
+        displacement=shift,
+        rotation=0.0,
+        scale=0.0,
+        covariance=covariance,
+        inliers=inliers,
+        residual_px=float(np.sqrt(np.mean(residual**2))),
+        residual_sigmas=1.0,
+        speed_mean=float(speed[inliers].mean()),
+        speed_std=float(speed[inliers].std()),
+        model="mean",
+    )
+
+
+def _mode(displacement: Array, sigma: Array) -> NDArray[np.bool_]:
+    """Vectors near the one that most of the best-measured others are near."""
+    best = np.argsort(sigma.sum(axis=1), kind="stable")[:_MODE_VECTORS]
+    some = displacement[best]
+    # Wide enough for a field that rotates a little, narrow enough to tell slow RSOs apart.
+    reach = 1.0 + 3 * sigma[best].mean(axis=1)
+    distance = np.hypot(*(some[:, None] - some[None]).transpose(2, 0, 1))
+    winner = some[np.argmax(np.sum(distance <= reach[:, None], axis=1))]
+    return np.hypot(*(displacement - winner).T) <= 1.0 + 3 * sigma.mean(axis=1)
+
+
+def _robust_fit(
+    offset: Array,
+    displacement: Array,
+    sigma: Array,
+    speed: Array,
+    centre: Array,
+    start: NDArray[np.bool_],
+    model: str,
+) -> StarFieldMotion:
+    """Iteratively reweighted least squares with Tukey's biweight."""
+    design = _design(offset)
+    weight = np.where(start, 1.0, 0.0)
+    values = np.zeros(4)
+    covariance = np.zeros((4, 4))
+    used, spread = 2, 1.0
+    for _ in range(15):
+        enough = np.count_nonzero(weight) >= _STARS_FOR_SIMILARITY
+        used = 4 if model == "similarity" and enough else 2
+        scaled = np.sqrt(weight)[:, None] / sigma
+        a = (design[..., :used] * scaled[..., None]).reshape(-1, used)
+        solution = np.linalg.lstsq(a, (displacement * scaled).ravel(), rcond=None)[0]
+        before, values = values, np.append(solution, np.zeros(4 - used))
+        residual = displacement - design @ values
+        normal = np.hypot(*(residual / sigma).T) / np.sqrt(2)
+        # Errors larger than stated (blends, a distorted field) widen the scale, never narrow it.
+        spread = max(1.0, 1.4826 * float(np.median(normal[weight > 0])) / 1.24)
+        weight = np.clip(1 - (normal / (_TUKEY * spread)) ** 2, 0, None) ** 2
+        covariance[:used, :used] = np.linalg.pinv(a.T @ a) * spread**2
+        if np.allclose(values, before, atol=1e-4) or not weight.any():
+            break
+    covariance[used:], covariance[:, used:] = 0, 0
+    inliers = weight > 0
+    if not inliers.any():
+        inliers = start
+    return StarFieldMotion(
+        centre=centre,
+        displacement=values[:2],
+        rotation=float(values[3]),
+        scale=float(values[2]),
+        covariance=covariance,
+        inliers=inliers,
+        residual_px=float(np.sqrt(np.mean(residual[inliers] ** 2))),
+        residual_sigmas=spread,
+        speed_mean=float(speed[inliers].mean()),
+        speed_std=float(speed[inliers].std()),
+        model="similarity" if used == 4 else "shift",
+    )
+
+
+def _design(offset: Array) -> Array:
+    """Rows of the linear model for (shift x, shift y, scale, rotation), (N, 2, 4)."""
+    design = np.zeros((len(offset), 2, 4))
+    design[:, 0, 0] = design[:, 1, 1] = 1
+    design[:, :, 2] = offset
+    design[:, 0, 3], design[:, 1, 3] = -offset[:, 1], offset[:, 0]
+    return design
