@@ -1,0 +1,286 @@
+"""The pipeline: the order of the stages, and the previous frame.
+
+The one place that knows all stages.  Live nodes and offline commands feed it one image at a time
+and get a `FrameResult`; what is different between them lies outside.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ofsat_ros.detection import DETECTION_DTYPE, detect
+from ofsat_ros.objects import OBJECT_DTYPE, find_objects
+from ofsat_ros.optical_flow import Flow, FlowInput, flow_engine
+from ofsat_ros.parameters import Parameters
+from ofsat_ros.preprocessing import preprocess
+from ofsat_ros.star_field import StarFieldMotion, estimate_motion, vote_shift
+
+_SMALLEST_SIDE = 16
+_DTYPES = ("uint8", "uint16", "float32")
+
+
+class ImageError(ValueError):
+    """An image that the pipeline cannot process; the message says why."""
+
+
+@dataclass
+class FrameResult:
+    """What one frame gave.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Its stamp, ns UTC.
+    frame : int
+        Count of frames that the pipeline was given before it.
+    shape : (height, width)
+        Size of the image, px.
+    dt_s : float
+        Time since the frame it was compared with, s; NaN if there was none.
+    reset : str
+        Why there was none, in words; empty if there was.
+    objects : (N,) OBJECT_DTYPE
+        Objects of this frame.
+    flow : Flow
+        Flow from the previous frame to this one.
+    star_field : StarFieldMotion or None
+        Motion of the star field; None if it was not found.
+    detections : (K,) DETECTION_DTYPE
+        RSO candidates.
+    background, noise, threshold : float
+        Median level of the background, std of the smoothed background, threshold over the
+        background, DN.
+    reason : str
+        Why nothing was detected, in words; empty if something was.
+    seconds : dict
+        Time that each stage took, s.
+    """
+
+    stamp_ns: int
+    frame: int
+    shape: tuple[int, int]
+    dt_s: float = float("nan")
+    reset: str = ""
+    objects: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, OBJECT_DTYPE))
+    flow: Flow = field(default_factory=Flow.empty)
+    star_field: StarFieldMotion | None = None
+    detections: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, DETECTION_DTYPE))
+    background: float = float("nan")
+    noise: float = float("nan")
+    threshold: float = float("nan")
+    reason: str = ""
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Previous:
+    """What is kept of the previous frame."""
+
+    stamp_ns: int
+    dtype: np.dtype
+    objects: NDArray[np.void]
+    flow_input: FlowInput
+
+
+class Pipeline:
+    """Detect RSOs in a sequence of images.
+
+    Parameters
+    ----------
+    parameters : Parameters, optional
+        The choices of all stages; default: the preset ``robust``.  The attribute may be assigned
+        at any time and takes effect at the next frame.
+
+    Examples
+    --------
+    >>> pipeline = Pipeline(Parameters.preset("robust"))
+    >>> image = np.zeros((64, 64), np.uint16)
+    >>> pipeline.process(image, stamp_ns=0).reset
+    'first frame'
+    """
+
+    def __init__(self, parameters: Parameters | None = None) -> None:
+        self.parameters = parameters or Parameters.preset()
+        self._previous: _Previous | None = None
+        self._reset_reason = "first frame"
+        self._frames = 0
+
+    def reset(self, reason: str = "reset asked for") -> None:
+        """Forget the previous frame; the next one starts afresh and gives `reason`."""
+        self._previous = None
+        self._reset_reason = reason
+
+    def process(self, image: NDArray[np.generic], stamp_ns: int) -> FrameResult:
+        """Process the next image.
+
+        Parameters
+        ----------
+        image : (H, W) uint8, uint16 or float32
+            The image, DN; at least 16 px on each side.  It is not changed.
+        stamp_ns : int
+            Middle of the exposure, ns UTC.
+
+        Returns
+        -------
+        FrameResult
+
+        Raises
+        ------
+        ImageError
+            If the image has another type or shape, or no finite pixel.  The previous frame stays
+            as it was.
+        """
+        _check(image)
+        parameters = self.parameters
+        result = FrameResult(stamp_ns, self._frames, (image.shape[0], image.shape[1]))
+        with _timed(result.seconds, "preprocessing"):
+            try:
+                pre = preprocess(image, parameters)
+            except ValueError as error:
+                raise ImageError(str(error)) from error
+        self._frames += 1
+        result.background, result.noise, result.threshold = (
+            pre.background,
+            pre.noise,
+            pre.threshold,
+        )
+        with _timed(result.seconds, "objects"):
+            result.objects, labels = find_objects(
+                pre.image,
+                pre.smoothed,
+                pre.mask,
+                pre.pixel_noise,
+                pre.noise,
+                pre.noise_ratio,
+                parameters.min_area_px,
+                parameters.max_objects,
+            )
+        xy, sigma = _pairs(result.objects, "x", "y"), _pairs(result.objects, "sigma_x", "sigma_y")
+        length = result.objects["length"]
+        current = FlowInput(pre.smoothed, pre.mask, labels, xy, sigma, length, pre.noise)
+
+        previous = self._usable_previous(image, stamp_ns, parameters.max_gap_s)
+        result.reset, self._reset_reason = self._reset_reason, ""
+        if previous is not None:
+            result.dt_s = (stamp_ns - previous.stamp_ns) / 1e9
+            self._compare(previous, current, result, parameters)
+        self._previous = _Previous(stamp_ns, image.dtype, result.objects, current)
+        result.reason = _why_nothing(result)
+        return result
+
+    def _usable_previous(
+        self, image: NDArray[np.generic], stamp_ns: int, max_gap_s: float
+    ) -> _Previous | None:
+        """The previous frame, or None with the reason in `_reset_reason`."""
+        previous = self._previous
+        if previous is None:
+            return None
+        before, now = previous.flow_input.smoothed.shape, image.shape
+        dt_s = (stamp_ns - previous.stamp_ns) / 1e9
+        if before != now:
+            self.reset(
+                f"the image's size changed from {before[1]}x{before[0]} to {now[1]}x{now[0]}"
+            )
+        elif previous.dtype != image.dtype:
+            self.reset(f"the image's type changed from {previous.dtype} to {image.dtype}")
+        elif dt_s == 0:
+            self.reset("two frames have the same stamp")
+        elif dt_s < 0:
+            self.reset(f"time ran backwards by {-dt_s:g} s")
+        elif dt_s > max_gap_s:
+            self.reset(f"a gap of {dt_s:g} s is longer than max_gap_s = {max_gap_s:g} s")
+        return self._previous
+
+    @staticmethod
+    def _compare(
+        previous: _Previous, current: FlowInput, result: FrameResult, parameters: Parameters
+    ) -> None:
+        """Fill in flow, star field and detections."""
+        guesses = np.zeros((1, 2))
+        if parameters.first_guess == "field":
+            with _timed(result.seconds, "star_field"):
+                shift = vote_shift(
+                    previous.flow_input.xy,
+                    previous.objects["flux"],
+                    current.xy,
+                    result.objects["flux"],
+                )
+            if shift is not None:
+                # No motion comes second: in rate tracking the RSOs stand still.
+                guesses = np.stack([shift, np.zeros(2)])
+        with _timed(result.seconds, "optical_flow"):
+            flow = flow_engine(parameters).measure(previous.flow_input, current, guesses)
+        result.flow = flow
+        with _timed(result.seconds, "star_field"):
+            valid = flow.valid
+            motion = estimate_motion(
+                flow.position[valid],
+                flow.displacement[valid],
+                flow.sigma[valid],
+                flow.speed_mean[valid],
+                result.shape,
+                parameters.star_field_model,
+                parameters.outlier_sigmas,
+            )
+        if motion is None:
+            return
+        inliers = np.zeros(len(flow), bool)
+        inliers[valid] = motion.inliers
+        result.star_field = motion.with_inliers(inliers)
+        with _timed(result.seconds, "detection"):
+            result.detections = detect(
+                result.objects,
+                flow,
+                motion,
+                previous.flow_input,
+                current,
+                result.dt_s,
+                parameters.rso_test,
+                parameters.rso_sigmas,
+                parameters.min_relative_px,
+            )
+
+
+def _check(image: NDArray[np.generic]) -> None:
+    if image.ndim != 2 or min(image.shape) < _SMALLEST_SIDE:
+        raise ImageError(
+            f"an image of shape {image.shape} cannot be processed: it must have two dimensions"
+            f" of at least {_SMALLEST_SIDE} px"
+        )
+    if image.dtype.name not in _DTYPES:
+        raise ImageError(
+            f"an image of {image.dtype.name} cannot be processed: it must be {', '.join(_DTYPES)}"
+        )
+
+
+def _pairs(objects: NDArray[np.void], first: str, second: str) -> NDArray[np.float64]:
+    return np.stack([objects[first], objects[second]], axis=1)
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start
+
+
+def _why_nothing(result: FrameResult) -> str:
+    """In words, why the frame has no detection."""
+    if len(result.detections):
+        return ""
+    if not len(result.objects):
+        return "no object is above the threshold"
+    if result.reset:
+        return f"no previous frame to compare with: {result.reset}"
+    valid = int(np.count_nonzero(result.flow.valid))
+    if not valid:
+        return f"none of {len(result.objects)} objects was found in the previous frame"
+    if result.star_field is None:
+        return f"the {valid} flow vectors do not agree on a motion of the star field"
+    return f"everything moves with the star field ({result.star_field.star_count} stars)"
