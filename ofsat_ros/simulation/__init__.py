@@ -1,0 +1,43 @@
+"""Frames of a simulated telescope camera, with the truth of what is in them.
+
+It stands at the start of the flow, in the place of a camera, and knows no other stage: tests,
+benchmarks, ``ofsat simulate`` and the simulator node feed its frames to the pipeline.
+
+The sky is a plane, in arcsec.  Stars fill it without end, at random; the camera drifts over it at
+an angular rate, which may be changed between frames, and the field may turn about the image's
+centre.  All rates are against the stars: a star's rate is 0, and what moves at the camera's rate
+stands still in the image.  In the image, at field angle a and rotation w about the centre c::
+
+    p = c + R(a) (sky - pointing) / pixel scale
+    v = w J (p - c) + (R(a) object rate - camera rate) / pixel scale
+
+with R(a) turning the x axis towards the y axis and J = R(90 deg).  The object's rate is in the
+axes of the sky, which are the image's at the start; the camera's in those of the image now.
+
+A frame is made in this order: light of the stars and RSOs, photon noise, sensor noise,
+quantisation.  Fluxes and noise are set in percent of full scale, so that a scenario looks the
+same at every bit depth.  Same settings, same bytes: whatever is random derives from the seed and
+from the sky's tile or the frame's number, never from what was rendered before.
+"""
+
+from ofsat_ros.simulation.scenarios import SCENARIOS, scenario
+from ofsat_ros.simulation.settings import RSO, SimulatorSettings
+from ofsat_ros.simulation.simulator import (
+    STAR_DTYPE,
+    TRUTH_DTYPE,
+    SimulatedFrame,
+    SkySimulator,
+    write_truth,
+)
+
+__all__ = [
+    "RSO",
+    "SCENARIOS",
+    "STAR_DTYPE",
+    "TRUTH_DTYPE",
+    "SimulatedFrame",
+    "SimulatorSettings",
+    "SkySimulator",
+    "scenario",
+    "write_truth",
+]
