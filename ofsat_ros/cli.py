@@ -1,0 +1,214 @@
+"""The ``ofsat`` command: what needs no ROS graph.
+
+``process`` runs the same `Pipeline` as the detector node over a recording; ``simulate`` makes a
+recording with truth.  Exit code 0: done; 1: the input or output is not usable; 2: bad usage;
+130: stopped by Ctrl-C, with what was done so far on disk.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import click
+from tqdm import tqdm
+
+from ofsat_ros import __version__
+from ofsat_ros.parameters import (
+    DEFAULT_PRESET,
+    Description,
+    ParameterError,
+    Parameters,
+    preset_names,
+)
+from ofsat_ros.pipeline import ImageError, Pipeline
+from ofsat_ros.recordings import BagWriter, RecordingError, open_recording
+from ofsat_ros.results import DETECTIONS, STAR_FIELD, ResultWriter
+from ofsat_ros.simulation import SCENARIOS, scenario, write_truth
+
+IMAGE_TOPIC = "/camera/image_raw"
+FRAME_ID = "camera_optical_frame"
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 99})
+@click.version_option(__version__, prog_name="ofsat")
+def main() -> None:
+    """Find satellites and debris in recordings of a telescope camera."""
+
+
+def _parameter_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Add an option for each pipeline parameter, from the table."""
+    for about in reversed(list(Parameters.describe())):
+        option = click.option(
+            f"--{about.name.replace('_', '-')}",
+            about.name,
+            type=_option_type(about),
+            help=f"{about.meaning} [{about.stage}; {about.allowed} {about.unit}]",
+        )
+        command = option(command)
+    return command
+
+
+def _option_type(about: Description) -> Any:
+    return click.Choice(about.choices) if about.choices else type(about.default)
+
+
+@main.command()
+@click.argument("recording", type=click.Path(path_type=Path))
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    type=click.Path(file_okay=False, path_type=Path),
+    help=f"folder for {DETECTIONS} and {STAR_FIELD}",
+)
+@click.option("--topic", help="image topic, if the recording holds several")
+@click.option("--preset", default=DEFAULT_PRESET, type=click.Choice(preset_names()))
+@click.option("--force", is_flag=True, help="replace the results of an earlier run")
+@_parameter_options
+def process(
+    recording: Path,
+    output: Path,
+    topic: str | None,
+    preset: str,
+    force: bool,
+    **changes: Any,
+) -> None:
+    """Detect RSOs in RECORDING: a rosbag2 folder, a bare .mcap or .db3 file, or a ROS 1 bag."""
+    with ExitStack() as stack:
+        try:
+            given = {name: value for name, value in changes.items() if value is not None}
+            parameters = Parameters.preset(preset, **given)
+            frames = stack.enter_context(open_recording(recording, topic))
+            _claim(output, force)
+            writer = stack.enter_context(ResultWriter(output))
+        except (ParameterError, RecordingError, OSError) as error:
+            _fail(error)
+        totals = _Totals()
+        try:
+            _process(frames, Pipeline(parameters), writer, totals)
+        except (RecordingError, OSError) as error:
+            _fail(error)
+        except KeyboardInterrupt:
+            _say(f"stopped; {totals} so far, in {output}")
+            sys.exit(130)
+        for problem in frames.problems:
+            _say(f"note: {problem}")
+    _say(f"{totals}; {DETECTIONS} and {STAR_FIELD} are in {output}")
+    if not totals.frames:
+        sys.exit(1)
+
+
+class _Totals:
+    """Counts for the summary."""
+
+    def __init__(self) -> None:
+        self.frames = self.detections = self.refused = 0
+        self.reason = ""
+
+    def __str__(self) -> str:
+        words = f"{self.detections} RSO detections in {self.frames} frames"
+        if self.refused:
+            words += f" ({self.refused} more could not be processed)"
+        if not self.detections and self.reason:
+            words += f"; the last frame says: {self.reason}"
+        return words
+
+
+def _process(frames: Any, pipeline: Pipeline, writer: ResultWriter, totals: _Totals) -> None:
+    for frame in tqdm(frames, unit=" frames", dynamic_ncols=True, disable=None):
+        try:
+            result = pipeline.process(frame.image, frame.stamp_ns)
+        except ImageError as error:
+            totals.refused += 1
+            if totals.refused == 1:
+                _say(f"note: the frame stamped {frame.stamp_ns} is left out: {error}")
+            continue
+        if result.reset and totals.frames:
+            _say(f"note: frame {result.frame} starts afresh: {result.reset}")
+        writer.add(result)
+        totals.frames += 1
+        totals.detections += len(result.detections)
+        totals.reason = result.reason
+
+
+@main.command()
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    type=click.Path(path_type=Path),
+    help="bag to make: a new folder; its truth is written beside it as OUTPUT.truth.csv",
+)
+@click.option("--scenario", "name", default="sidereal", type=click.Choice(list(SCENARIOS)))
+@click.option("--seed", default=1, show_default=True, help="seed of everything that is random")
+@click.option("--frames", type=int, help="number of frames, if not the scenario's")
+@click.option(
+    "--size", type=(int, int), metavar="WIDTH HEIGHT", help="size in px, if not the scenario's"
+)
+@click.option("--bit-depth", type=click.IntRange(8, 16), help="bits per pixel")
+@click.option("--storage", default="mcap", type=click.Choice(["mcap", "sqlite3"]))
+@click.option("--compressed", is_flag=True, help="write PNG CompressedImage messages")
+@click.option("--force", is_flag=True, help="replace a bag of that name")
+def simulate(
+    output: Path,
+    name: str,
+    seed: int,
+    frames: int | None,
+    size: tuple[int, int] | None,
+    bit_depth: int | None,
+    storage: str,
+    compressed: bool,
+    force: bool,
+) -> None:
+    """Make a bag of simulated frames, with the truth of what is in them."""
+    changes: dict[str, Any] = {"frames": frames, "bit_depth": bit_depth}
+    if size:
+        changes.update(width=size[0], height=size[1])
+    truth = output.with_name(output.name + ".truth.csv")
+    topic = IMAGE_TOPIC + ("/compressed" if compressed else "")
+    try:
+        sky = scenario(name, seed, **{k: v for k, v in changes.items() if v is not None})
+        rows = []
+        with BagWriter(output, storage=storage, compression="none", force=force) as bag:
+            for frame in tqdm(sky, total=len(sky), unit=" frames", disable=None):
+                bag.write_image(
+                    topic, frame.image, frame.stamp_ns, FRAME_ID, compressed=compressed
+                )
+                rows.append(frame.truth)
+        write_truth(truth, rows)
+    except (ParameterError, RecordingError, OSError) as error:
+        _fail(error)
+    except KeyboardInterrupt:
+        write_truth(truth, rows)
+        _say(f"stopped; {len(rows)} frames are in {output}")
+        sys.exit(130)
+    _say(f"{len(rows)} frames on {topic} in {output}, truth in {truth}")
+
+
+def _claim(folder: Path, force: bool) -> None:
+    """Make the folder for the results, or refuse to overwrite those that it holds."""
+    folder.mkdir(parents=True, exist_ok=True)
+    old = [name for name in (DETECTIONS, STAR_FIELD) if (folder / name).exists()]
+    if old and not force:
+        raise RecordingError(
+            f"{folder} already holds {' and '.join(old)}; choose another folder, or --force to"
+            " replace them"
+        )
+
+
+def _fail(error: Exception) -> None:
+    _say(f"ofsat: {error}")
+    sys.exit(1)
+
+
+def _say(line: str) -> None:
+    """One line on standard error, beside the progress bar."""
+    tqdm.write(line, file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,121 @@
+"""Pictures of what was found: the last step, for people.
+
+`annotate` draws one frame; the detector node publishes it, the recorder keeps some of them.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ofsat_ros.pipeline import FrameResult
+
+# BGR
+_STAR, _RSO, _TEXT = (255, 150, 60), (70, 70, 255), (235, 235, 235)
+# Points are drawn to a sixteenth of a pixel (cv2's fixed-point drawing).
+_SHIFT = 4
+_SHORTEST_SIDE = 480
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+
+def annotate(
+    image: NDArray[np.generic], result: FrameResult, scale: float = 5.0
+) -> NDArray[np.uint8]:
+    """Draw what was found over the image.
+
+    Stars' flow in blue, each RSO in a red box with its flow, speed and SNR; a line on top says
+    how many there are, or why there is none.
+
+    Parameters
+    ----------
+    image : (H, W) uint8, uint16 or float32
+        The image, DN.
+    result : FrameResult
+        What it gave.
+    scale : float
+        Length of a drawn vector, in frames of motion.
+
+    Returns
+    -------
+    (h, w, 3) uint8
+        The picture, BGR; as large as the image, or an integer multiple if that is small.
+    """
+    zoom = max(1, -(-_SHORTEST_SIDE // min(image.shape)))
+    gray = cv2.resize(
+        _stretch(image, result), None, fx=zoom, fy=zoom, interpolation=cv2.INTER_NEAREST
+    )
+    picture = cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR)
+    flow = result.flow
+    if result.star_field is not None:
+        for row in np.flatnonzero(result.star_field.inliers):
+            _draw_vector(picture, flow.position[row], flow.displacement[row] * scale, zoom, _STAR)
+    for rso in result.detections:
+        _draw_rso(picture, rso, result.dt_s * scale, zoom)
+    _draw_caption(picture, result)
+    return picture
+
+
+def _stretch(image: NDArray[np.generic], result: FrameResult) -> NDArray[np.uint8]:
+    """8 bits that show faint stars: asinh over the background, in units of its noise."""
+    noise = result.noise if np.isfinite(result.noise) and result.noise > 0 else 1.0
+    level = (
+        result.background
+        if np.isfinite(result.background)
+        else float(np.median(image.astype(np.float32)))
+    )
+    # The smoothed noise is about a third of the pixel noise; 12 of it are some four of those.
+    value = np.maximum((image.astype(np.float32) - np.float32(level)) / np.float32(12 * noise), 0)
+    shown = np.arcsinh(np.nan_to_num(value)) * np.float32(55) + np.float32(18)
+    return np.minimum(shown, 255).astype(np.uint8)
+
+
+def _draw_vector(
+    picture: NDArray[np.uint8],
+    tip: NDArray[np.float64],
+    vector: NDArray[np.float64],
+    zoom: int,
+    colour: tuple[int, int, int],
+) -> None:
+    """A line that ends where the object is, and a dot there so that no motion shows, too."""
+    end, start = _fixed(tip, zoom), _fixed(tip - vector, zoom)
+    cv2.line(picture, start, end, colour, 1, cv2.LINE_AA, _SHIFT)
+    cv2.circle(picture, end, 2 << _SHIFT, colour, 1, cv2.LINE_AA, _SHIFT)
+
+
+def _draw_rso(picture: NDArray[np.uint8], rso: np.void, seconds: float, zoom: int) -> None:
+    centre = np.array([rso["x"], rso["y"]])
+    half = 8 + np.nan_to_num(rso["length"]) / 2
+    low, high = _fixed(centre - half, zoom), _fixed(centre + half, zoom)
+    cv2.rectangle(picture, low, high, _RSO, 1, cv2.LINE_AA, _SHIFT)
+    velocity = np.array([rso["vx"], rso["vy"]])
+    _draw_vector(picture, centre, velocity * seconds, zoom, _RSO)
+    name = f"#{rso['track_id']} " if rso["track_id"] else ""
+    label = f"{name}{np.hypot(*velocity):.2f} px/s SNR {rso['snr']:.0f}"
+    _write(picture, label, (high[0] >> _SHIFT) + 4, (low[1] >> _SHIFT) + 8, _RSO)
+
+
+def _draw_caption(picture: NDArray[np.uint8], result: FrameResult) -> None:
+    count = len(result.detections)
+    found = f"{count} RSO{'s' * (count != 1)}" if count else f"no RSO: {result.reason}"
+    line = f"frame {result.frame}: {found}"
+    if result.star_field is not None and count:
+        dx, dy = result.star_field.displacement
+        line += f"; {result.star_field.star_count} stars move ({dx:+.2f}, {dy:+.2f}) px"
+    _write(picture, line, 6, 16, _TEXT)
+
+
+def _write(
+    picture: NDArray[np.uint8], text: str, x: int, y: int, colour: tuple[int, int, int]
+) -> None:
+    """Text that stays inside the picture and readable on bright ground."""
+    (width, _), _ = cv2.getTextSize(text, _FONT, 0.42, 1)
+    at = (max(2, min(x, picture.shape[1] - width - 4)), max(12, min(y, picture.shape[0] - 4)))
+    cv2.putText(picture, text, at, _FONT, 0.42, (0, 0, 0), 3, cv2.LINE_AA)
+    cv2.putText(picture, text, at, _FONT, 0.42, colour, 1, cv2.LINE_AA)
+
+
+def _fixed(xy: NDArray[np.float64], zoom: int) -> tuple[int, int]:
+    """A point of the image in the picture's fixed-point pixels."""
+    x, y = np.rint(((xy + 0.5) * zoom - 0.5) * (1 << _SHIFT)).astype(int)
+    return int(x), int(y)
