@@ -1,0 +1,85 @@
+# Each command sets up what it needs in .venv (the first time only) and then runs.
+
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DEFAULT_GOAL := help
+
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/installed
+say := @printf '%s\n'
+
+# A ROS sourced in this shell, or another virtual environment's wheels, must not leak into ours.
+unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH PYTHONHOME PYTHONPATH
+unexport AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH ROS_DISTRO ROS_LOCALHOST_ONLY
+export RMW_IMPLEMENTATION := rmw_fastrtps_cpp
+export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
+
+# The stamp holds this folder's path: one that was moved, or whose Python is gone, does not count.
+ifneq ($(shell test -x $(BIN)/python && cat $(STAMP) 2>/dev/null),$(CURDIR))
+.PHONY: $(STAMP)
+endif
+
+.PHONY: help
+help:
+	$(say) 'make demo   replay a sample bag to the detector over DDS; results in demo_output/'
+	$(say) 'make test   run all tests'
+	$(say) 'make lint   check format, style and types'
+	$(say) "make bench  reproduce the paper's results as a table"
+	$(say) 'make clean  remove everything that make and colcon made'
+
+.PHONY: demo
+demo: $(STAMP)
+	$(say) 'demo: player -> detector -> recorder; results go to demo_output/'
+	@$(BIN)/demo --output demo_output
+
+.PHONY: test
+test: $(STAMP)
+	$(say) 'test: all tests, nodes over DDS and a colcon build among them'
+	@$(BIN)/python -m pytest
+
+.PHONY: lint
+lint: $(STAMP)
+	$(say) 'lint: format'
+	@$(BIN)/ruff format --check .
+	$(say) 'lint: style'
+	@$(BIN)/ruff check .
+	$(say) 'lint: types'
+	@$(BIN)/mypy
+
+.PHONY: bench
+bench: $(STAMP)
+	$(say) "bench: the paper's scenes, both engines"
+	@$(BIN)/python -m benchmarks.paper
+
+.PHONY: clean
+clean:
+	$(say) 'clean: .venv, demo_output, build, install, log and caches'
+	@rm -rf $(VENV) demo_output build install log .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	@rm -rf *.egg-info
+	@find . -name __pycache__ -prune -exec rm -rf {} +
+
+# Without a valid stamp the environment is made anew, since an interrupted pip leaves it in pieces;
+# with one that is merely older than setup.py, pip brings it up to date.
+$(STAMP): setup.py
+	$(say) 'setup: looking for Python 3.11 to 3.14'
+	@test "$$(uname -m)" = x86_64 || { \
+	    echo 'make: the ROS 2 wheels exist for x86-64 only. Here, build with colcon on a ROS 2' \
+	         'Jazzy from apt: see README.md.' >&2; exit 1; }
+	@python=; for name in python3 python3.14 python3.13 python3.12 python3.11; do \
+	    if $$name -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 15))' 2>/dev/null; \
+	    then python=$$name; break; fi; done; \
+	if [ -z "$$python" ]; then \
+	    echo 'make: no Python 3.11, 3.12, 3.13 or 3.14 found. On Debian 12, Ubuntu 24.04 and later:' \
+	         'sudo apt install python3 python3-venv' >&2; exit 1; fi; \
+	if ! $$python -c 'import ensurepip, venv' 2>/dev/null; then \
+	    echo "make: $$python cannot make a virtual environment. On Debian or Ubuntu:" \
+	         'sudo apt install python3-venv' >&2; exit 1; fi; \
+	if [ "$$(test -x $(BIN)/python && cat $(STAMP) 2>/dev/null)" != '$(CURDIR)' ]; then \
+	    echo "setup: making $(VENV) with $$($$python --version)"; \
+	    $$python -m venv --clear $(VENV); fi
+	@rm -f $(STAMP)
+	$(say) 'setup: installing ROS 2 and tools into $(VENV), 0.7 GB; minutes, but only once'
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check --editable '.[all]'
+	@printf '%s\n' '$(CURDIR)' > $(STAMP)
+	$(say) 'setup: done'

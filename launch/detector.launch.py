@@ -1,0 +1,89 @@
+"""Start the detector.
+
+For example::
+
+    ros2 launch ofsat_ros detector.launch.py image:=/camera/image_raw params_file:=my.yaml
+
+Sets the Fast DDS profile for large images unless the environment already names one; whoever sends
+the images needs it too.
+"""
+
+from pathlib import Path
+
+from ament_index_python.packages import get_package_share_directory
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
+from launch.substitutions import EnvironmentVariable, LaunchConfiguration
+from launch_ros.actions import Node
+
+from ofsat_ros.parameters import preset_names
+
+PROFILE = Path(
+    get_package_share_directory("ofsat_ros"), "config", "fastdds_large_images.xml"
+).as_posix()
+
+ARGUMENTS = [
+    DeclareLaunchArgument(
+        "namespace", default_value="", description="before the names of the node and its topics"
+    ),
+    DeclareLaunchArgument(
+        "image", default_value="", description="topic to read; empty: image, or image/compressed"
+    ),
+    DeclareLaunchArgument(
+        "image_transport",
+        default_value="",
+        choices=["", "raw", "compressed"],
+        description="how the images come; empty: as the parameters say",
+    ),
+    DeclareLaunchArgument(
+        "preset",
+        default_value="",
+        choices=["", *preset_names()],
+        description="named choices to start from; empty: as the parameters say",
+    ),
+    DeclareLaunchArgument(
+        "reliable_input",
+        default_value="",
+        choices=["", "true", "false"],
+        description="true: lose no frame, for replay; empty: as the parameters say",
+    ),
+    DeclareLaunchArgument(
+        "params_file", default_value="", description="YAML file of parameters; empty: none"
+    ),
+]
+
+
+def detector(context: LaunchContext) -> list[Node]:
+    """Return the node; an argument that is not given leaves the parameter as it would be."""
+    given = {
+        argument.name: LaunchConfiguration(argument.name).perform(context)
+        for argument in ARGUMENTS
+    }
+    parameters = {name: given[name] for name in ("preset", "image_transport") if given[name]}
+    if given["reliable_input"]:
+        parameters["reliable_input"] = given["reliable_input"] == "true"
+    files = [given["params_file"]] if given["params_file"] else []
+    names = ("image", "image/compressed") if given["image"] else ()
+    return [
+        Node(
+            package="ofsat_ros",
+            executable="detector",
+            name="detector",
+            namespace=given["namespace"],
+            output="screen",
+            parameters=[*files, parameters],
+            remappings=[(name, given["image"]) for name in names],
+        )
+    ]
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Describe what `ros2 launch` starts."""
+    profile = EnvironmentVariable("FASTRTPS_DEFAULT_PROFILES_FILE", default_value=PROFILE)
+    return LaunchDescription(
+        [
+            *ARGUMENTS,
+            SetEnvironmentVariable("FASTRTPS_DEFAULT_PROFILES_FILE", profile),
+            OpaqueFunction(function=detector),
+        ]
+    )

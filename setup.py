@@ -1,0 +1,70 @@
+"""Install ofsat_ros, for pip and for colcon alike."""
+
+import re
+from glob import glob
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = "ofsat_ros"
+VERSION = re.search(r'^__version__ = "(.+)"$', Path(NAME, "__init__.py").read_text(), re.M)[1]
+
+# ROS and OpenCV are extras, never requirements: a ROS machine has both from apt, where pip does
+# not see them and would put others in front of them.
+OPENCV = ["opencv-python-headless>=4.6"]
+ROS = [
+    "ros-jazzy-rclpy",
+    "ros-jazzy-rmw-fastrtps-cpp",
+    "ros-jazzy-diagnostic-msgs",
+    "ros-jazzy-geometry-msgs",
+    "ros-jazzy-rosgraph-msgs",
+    "ros-jazzy-sensor-msgs",
+    "ros-jazzy-std-srvs",
+    "ros-jazzy-visualization-msgs",
+    *OPENCV,
+]
+LINT = ["mypy>=2.4,<3", "ruff>=0.17,<0.18", "types-PyYAML", "types-tqdm"]
+TEST = [
+    "colcon-core",
+    "colcon-ros",
+    "hypothesis",
+    "pytest>=9",
+    "scipy",
+    "setuptools>=70.1,<80",  # the range in which colcon and pip can both build with it
+]
+
+NODES = ("detector", "player", "simulator", "recorder", "demo")
+
+setup(
+    name=NAME,
+    version=VERSION,
+    description="Detects satellites and debris in a telescope camera's stream by optical flow",
+    maintainer="ofsat_ros maintainers",
+    maintainer_email="maintainers@ofsat-ros.org",
+    license="Apache-2.0",
+    python_requires=">=3.11",
+    packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    package_data={NAME: ["presets/*.yaml", "data/*"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py"))),
+        # For people to copy from; the code reads the package's own, which pip installs too.
+        (f"share/{NAME}/config", sorted(glob(f"{NAME}/presets/*.yaml") + glob(f"{NAME}/data/*"))),
+    ],
+    zip_safe=False,
+    install_requires=["click", "numpy>=1.26", "PyYAML", "rosbags>=0.11", "tqdm"],
+    extras_require={
+        "ros": ROS,
+        "opencv": OPENCV,
+        "lint": LINT,
+        "test": TEST,
+        "all": [*ROS, *LINT, *TEST],
+    },
+    entry_points={
+        "console_scripts": [
+            f"ofsat = {NAME}.cli:main",
+            *(f"{node} = {NAME}.nodes.{node}:main" for node in NODES),
+        ]
+    },
+)

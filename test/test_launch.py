@@ -1,0 +1,179 @@
+"""The launch files start executables that exist, with parameters that exist.
+
+The wheels of ROS lack `launch`, so the files run with stand-ins that record what they ask for.
+"""
+
+import runpy
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ofsat_ros.parameters import (
+    DetectorParameters,
+    PlayerParameters,
+    SimulatorParameters,
+    preset_names,
+)
+from ofsat_ros.recordings import BagWriter, RecordingError
+
+ROOT = Path(__file__).parents[1]
+
+
+class Asked:
+    """Stands in for every class of `launch`, and keeps what it was made with."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.kind = type(self).__name__
+        self.args = args
+        self.kwargs = kwargs
+        self.name = args[0] if args else None
+
+    def perform(self, context: dict[str, str]) -> str:
+        return context[self.name]
+
+
+class Launch(ModuleType):
+    """Stands in for every module of `launch`."""
+
+    @staticmethod
+    def get_package_share_directory(package: str) -> str:
+        return f"/share/{package}"
+
+    def __getattr__(self, name: str) -> type[Asked]:
+        return type(name, (Asked,), {})
+
+
+@pytest.fixture
+def launch(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Return a function that runs a launch file with arguments and returns what it asks for."""
+    for name in ("actions", "event_handlers", "substitutions"):
+        monkeypatch.setitem(sys.modules, f"launch.{name}", Launch(name))
+    for name in ("actions", "parameter_descriptions"):
+        monkeypatch.setitem(sys.modules, f"launch_ros.{name}", Launch(name))
+    for name in ("launch", "launch_ros", "ament_index_python.packages"):
+        monkeypatch.setitem(sys.modules, name, Launch(name))
+
+    def run(name: str, **given: str) -> list[Asked]:
+        file = runpy.run_path(f"{ROOT / 'launch' / name}")
+        asked = file["generate_launch_description"]().args[0]
+        arguments = {a.name: a.kwargs.get("default_value") for a in of_kind("Argument", asked)}
+        assert given.keys() <= arguments.keys()
+        for function in of_kind("OpaqueFunction", asked):
+            asked += function.kwargs["function"]({**arguments, **given})
+        return asked
+
+    return run
+
+
+def of_kind(kind: str, asked: list[Asked]) -> list[Asked]:
+    return [one for one in asked if one.kind.endswith(kind)]
+
+
+def only(kind: str, asked: list[Asked]) -> Asked:
+    (one,) = of_kind(kind, asked)
+    return one
+
+
+def test_detector_is_left_as_it_is_without_arguments(launch: Any):
+    node = only("Node", launch("detector.launch.py"))
+    assert (node.kwargs["package"], node.kwargs["executable"]) == ("ofsat_ros", "detector")
+    assert node.kwargs["parameters"] == [{}]
+    assert node.kwargs["remappings"] == []
+
+
+def test_detector_takes_its_arguments(launch: Any):
+    node = only(
+        "Node",
+        launch(
+            "detector.launch.py",
+            namespace="east",
+            image="/cam/image_raw",
+            image_transport="compressed",
+            preset="paper_opencv",
+            reliable_input="false",
+            params_file="my.yaml",
+        ),
+    )
+    assert node.kwargs["namespace"] == "east"
+    # The later wins: what is said on the command line is said on purpose.
+    file, parameters = node.kwargs["parameters"]
+    assert file == "my.yaml"
+    assert parameters == {
+        "preset": "paper_opencv",
+        "image_transport": "compressed",
+        "reliable_input": False,
+    }
+    DetectorParameters.of(parameters)
+    assert node.kwargs["remappings"] == [
+        ("image", "/cam/image_raw"),
+        ("image/compressed", "/cam/image_raw"),
+    ]
+
+
+def test_detector_offers_the_presets_there_are(launch: Any):
+    arguments = {one.name: one for one in of_kind("Argument", launch("detector.launch.py"))}
+    assert arguments["preset"].kwargs["choices"] == ["", *preset_names()]
+
+
+def test_detector_sets_the_profile_that_is_installed(launch: Any):
+    variable = only("SetEnvironmentVariable", launch("detector.launch.py"))
+    name, value = variable.args
+    assert name == value.name == "FASTRTPS_DEFAULT_PROFILES_FILE"
+    profile = value.kwargs["default_value"]
+    assert profile == "/share/ofsat_ros/config/fastdds_large_images.xml"
+    assert (ROOT / "ofsat_ros" / "data" / Path(profile).name).is_file()
+
+
+def test_simulation_starts_simulator_and_detector(launch: Any):
+    asked = launch("simulation.launch.py")
+    node = only("Node", asked)
+    assert node.kwargs["executable"] == "simulator"
+    (parameters,) = node.kwargs["parameters"]
+    defaults = {one.name: one.kwargs["default_value"] for one in of_kind("Argument", asked)}
+    table = SimulatorParameters()
+    assert defaults == {name: f"{getattr(table, name)}" for name in parameters}
+    assert Path(only("IncludeLaunchDescription", asked).name).name == "detector.launch.py"
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_replay_joins_player_and_detector_at_the_image_topic(
+    launch: Any, tmp_path: Path, compressed: bool
+):
+    with BagWriter(tmp_path / "bag") as bag:
+        sky = np.zeros((16, 16), np.uint8)
+        bag.write_image("/cam/image_raw", sky, 1, "cam", compressed=compressed)
+    asked = launch("replay.launch.py", bag=f"{tmp_path / 'bag'}", rate="2")
+
+    player = only("Node", asked)
+    assert player.kwargs["executable"] == "player"
+    (parameters,) = player.kwargs["parameters"]
+    assert parameters["bag"].kwargs == {"value_type": str}
+    parameters["bag"] = parameters["bag"].name
+    assert parameters["bag"] == f"{tmp_path / 'bag'}"
+    assert parameters["topic"] == "/cam/image_raw"
+    assert parameters["rate"] == 2.0
+    PlayerParameters.of(parameters)
+
+    detector = only("IncludeLaunchDescription", asked)
+    assert Path(detector.name).name == "detector.launch.py"
+    arguments = dict(detector.kwargs["launch_arguments"])
+    assert arguments == {
+        "image": "/cam/image_raw",
+        "image_transport": "compressed" if compressed else "raw",
+        "reliable_input": "true",
+    }
+    assert only("Node", launch("detector.launch.py", **arguments))
+
+    assert only("OnProcessExit", [asked[-1].args[0]]).kwargs["target_action"] is player
+
+
+def test_replay_says_which_image_topics_there_are(launch: Any, tmp_path: Path):
+    with BagWriter(tmp_path / "bag") as bag:
+        for topic in ("/east", "/west"):
+            bag.write_image(topic, np.zeros((16, 16), np.uint8), 1, "cam")
+    with pytest.raises(RecordingError, match=r"/east \(1\), /west \(1\)"):
+        launch("replay.launch.py", bag=f"{tmp_path / 'bag'}")
