@@ -1,0 +1,199 @@
+"""The demo: a bag's player, a detector and a recorder, each a process of its own, over DDS.
+
+Starts recorder and detector, waits until one hears the other, plays the bag, and ends by itself
+with a summary.  It joins no ROS graph: it starts the others and ends them, whatever happens.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import ofsat_ros
+from ofsat_ros.nodes.recorder import BAG, HEARING
+from ofsat_ros.recordings import COMPRESSED_IMAGE, Bag, RecordingError
+from ofsat_ros.results import DETECTIONS
+
+_START_S = 30.0
+# Without a new line from anybody for so long, a frame will not be answered any more.
+_SILENCE_S = 30.0
+_PATIENCE_S = {signal.SIGINT: 5.0, signal.SIGTERM: 2.0, signal.SIGKILL: 2.0}
+
+
+class DemoError(Exception):
+    """The demo cannot go on; the message says why."""
+
+
+def main() -> int:
+    """Run the demo; return 0 if every frame was answered, 1 if not, 2 if it could not start."""
+    options = _options()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        return _run(options)
+    except (DemoError, RecordingError) as error:
+        sys.stderr.write(f"demo: {error}\n")
+        return 2
+    except KeyboardInterrupt:
+        sys.stderr.write("demo: stopped\n")
+        return 130
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser("demo", description="Replay a bag to a detector, over DDS.")
+    parser.add_argument("--bag", type=Path, help="bag to play; default: the first sample bag")
+    parser.add_argument(
+        "--output", default="demo_output", help="folder of the results, %(default)s"
+    )
+    parser.add_argument(
+        "--rate", type=float, default=10.0, help="speed; 0: the fastest; default %(default)s"
+    )
+    return parser.parse_args()
+
+
+def _run(options: argparse.Namespace) -> int:
+    bag = options.bag or _sample_bag()
+    topic, compressed, count = _image_topic(bag)
+    name = "image/compressed" if compressed else "image"
+    transport = "compressed" if compressed else "raw"
+    print(f"demo: {count} frames of {topic} in {bag}")
+    with _children() as start:
+        recorder = start("recorder", "-p", f"output:={options.output}", "-p", f"frames:={count}")
+        lines = _Echo(recorder)
+        detector = start(
+            "detector",
+            *("-p", "reliable_input:=true"),
+            *("-p", f"image_transport:={transport}"),
+            *("-r", f"{name}:={topic}"),
+        )
+        lines.wait_for(HEARING, detector)
+        player = start(
+            "player", "-p", f"bag:={bag}", "-p", f"topic:={topic}", "-p", f"rate:={options.rate}"
+        )
+        lines.wait_for_end(player, detector)
+    return _sum_up(Path(options.output), count)
+
+
+def _sample_bag() -> Path:
+    """Return the first sample bag of the source tree or of the installed share folder."""
+    package = Path(ofsat_ros.__file__).parent
+    prefixes = os.environ.get("AMENT_PREFIX_PATH", sys.prefix).split(os.pathsep)
+    folders = [package.parent, *(Path(p, "share", "ofsat_ros") for p in prefixes)]
+    for folder in folders:
+        bags = sorted(path.parent for path in folder.glob("bags/*/metadata.yaml"))
+        if bags:
+            return bags[0]
+    raise DemoError("no sample bag is installed: give one with --bag PATH")
+
+
+def _image_topic(path: Path) -> tuple[str, bool, int]:
+    """Return name, whether compressed, and count of frames of a bag's first image topic."""
+    with Bag(path) as bag:
+        for name, about in bag.topics.items():
+            if about.is_image and about.count:
+                return name, about.msgtype == COMPRESSED_IMAGE, about.count
+    raise DemoError(f"{path} holds no images")
+
+
+@contextmanager
+def _children() -> Iterator:
+    """Give a function that starts a node; all that were started are ended in any case."""
+    running: list[subprocess.Popen] = []
+    environment = {
+        # Nobody else's graph: the demo neither hears nor disturbs one.
+        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        **os.environ,
+    }
+
+    def start(node: str, *ros_arguments: str) -> subprocess.Popen:
+        output = subprocess.PIPE if node == "recorder" else None
+        command = [sys.executable, "-m", f"ofsat_ros.nodes.{node}", "--ros-args", *ros_arguments]
+        # An own session: Ctrl-C reaches this process, which then ends them in order.
+        process = subprocess.Popen(
+            command, stdout=output, text=True, env=environment, start_new_session=True
+        )
+        running.append(process)
+        return process
+
+    try:
+        yield start
+    finally:
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        for process in reversed(running):
+            _end(process)
+        signal.signal(signal.SIGINT, before)
+
+
+def _end(process: subprocess.Popen) -> None:
+    for number, patience_s in _PATIENCE_S.items():
+        if process.poll() is not None:
+            return
+        process.send_signal(number)
+        try:
+            process.wait(patience_s)
+        except subprocess.TimeoutExpired:
+            continue
+
+
+class _Echo:
+    """Prints the recorder's lines as they come, and waits on them."""
+
+    def __init__(self, recorder: subprocess.Popen) -> None:
+        self._recorder = recorder
+        self._changed = threading.Condition()
+        self._lines: list[str] = []
+        self._last_s = time.monotonic()
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        for line in self._recorder.stdout:
+            print(line, end="", flush=True)
+            with self._changed:
+                self._lines.append(line.strip())
+                self._last_s = time.monotonic()
+                self._changed.notify_all()
+
+    def wait_for(self, wanted: str, *others: subprocess.Popen) -> None:
+        """Wait for a line; raise if a process ends before."""
+        deadline_s = time.monotonic() + _START_S
+        with self._changed:
+            while wanted not in self._lines:
+                ended = [p for p in (self._recorder, *others) if p.poll() is not None]
+                if ended or time.monotonic() > deadline_s:
+                    raise DemoError("the nodes did not start; see above")
+                self._changed.wait(0.1)
+
+    def wait_for_end(self, player: subprocess.Popen, detector: subprocess.Popen) -> None:
+        """Wait until the recorder has all frames, or nothing happens any more."""
+        while self._recorder.poll() is None:
+            if player.poll() is None:
+                self._last_s = time.monotonic()
+            if detector.poll() is not None or time.monotonic() - self._last_s > _SILENCE_S:
+                return
+            time.sleep(0.05)
+        self._thread.join(1.0)
+
+
+def _sum_up(output: Path, count: int) -> int:
+    """Print what came of it; return 0 if every frame was answered once."""
+    with Bag(output / BAG) as bag:
+        answered = bag.topics["/rso_detections"].count
+    found = len((output / DETECTIONS).read_text().splitlines()) - 1
+    print(
+        f"demo: {count} frames played, {answered} answered, {found} RSO detections;"
+        f" the files are in {output}"
+    )
+    return 0 if answered == count else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,242 @@
+"""The detector node: images in, RSO detections out; a shell around ``pipeline.Pipeline``.
+
+Its callbacks only take messages in; one worker thread processes and publishes, so that every
+frame it takes is answered once, in order: by an empty cloud if it could not be processed.
+A live camera (best effort) is answered for its newest frame; with ``reliable_input`` every frame
+is.  Topics, fields and units: README.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import threading
+import time
+import traceback
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Vector3Stamped
+from rclpy.clock import Clock, ClockType
+from rclpy.context import Context
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2
+from std_msgs.msg import Header
+from std_srvs.srv import SetBool, Trigger
+from visualization_msgs.msg import MarkerArray
+
+from ofsat_ros import report
+from ofsat_ros.detection import DETECTION_DTYPE
+from ofsat_ros.images import EncodingError
+from ofsat_ros.nodes import messages
+from ofsat_ros.nodes.health import Health
+from ofsat_ros.nodes.ros_parameters import NodeParameters, start_value
+from ofsat_ros.nodes.runtime import (
+    Inbox,
+    overridable_qos,
+    profile_path,
+    reliable,
+    run,
+)
+from ofsat_ros.parameters import DEFAULT_PRESET, DetectorParameters, Parameters, Table
+from ofsat_ros.pipeline import FrameResult, ImageError, Pipeline
+
+# Frames of a live camera that the middleware holds while one is taken out; 1 drops the odd one.
+_LIVE_DEPTH = 5
+# Results are small; a subscriber may be this far behind and lose none.
+_RESULTS_DEPTH = 100
+_PICTURES_DEPTH = 5
+_WARN_EVERY_S = 10.0
+
+
+class Detector(Node):
+    """Subscribes to images and publishes what ``Pipeline`` finds in them.
+
+    Parameters
+    ----------
+    context : Context, optional
+        ROS context; default: the process's.
+
+    Raises
+    ------
+    ofsat_ros.parameters.ParameterError
+        If a start parameter is bad.
+    """
+
+    def __init__(self, context: Context | None = None) -> None:
+        super().__init__("detector", context=context)
+        preset = start_value(self, "preset", DEFAULT_PRESET)
+        self._settings = NodeParameters(
+            self, Parameters.preset(preset), DetectorParameters(), changed=self._on_change
+        )
+        own = self._settings[DetectorParameters]
+        self._pipeline = Pipeline(self._settings[Parameters])
+        self._reset_wanted = ""
+        self._inbox = Inbox(own.queue_depth, newest_only=not own.reliable_input)
+        self._create_publishers()
+        self._images = self._subscribe(own)
+        self._image_publishers = 0
+        self._health = Health(self._images.topic_name, own.reliable_input, profile_path())
+        self._said_silence = False
+        self.create_service(Trigger, "~/reset", self._on_reset)
+        self.create_service(SetBool, "~/enable", self._on_enable)
+        # Steady: diagnostics go on when a player's clock stands still.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(1.0, self._publish_diagnostics, clock=steady)
+        self._worker = threading.Thread(target=self._work, name="detector", daemon=True)
+        self._worker.start()
+        self.get_logger().info(f"waiting for images on {self._images.topic_name}")
+
+    def close(self) -> None:
+        """End the worker; a frame in work may still be answered."""
+        self._inbox.close()
+        self._worker.join(0.5)
+
+    def _create_publishers(self) -> None:
+        def publisher(kind: type, topic: str, depth: int):
+            qos = reliable(depth)
+            return self.create_publisher(
+                kind, topic, qos, qos_overriding_options=overridable_qos()
+            )
+
+        self._detections = publisher(PointCloud2, "rso_detections", _RESULTS_DEPTH)
+        self._markers = publisher(MarkerArray, "flow_markers", _RESULTS_DEPTH)
+        self._motion = publisher(Vector3Stamped, "star_field_motion", _RESULTS_DEPTH)
+        self._annotated = publisher(Image, "image_annotated", _PICTURES_DEPTH)
+        self._diagnostics = publisher(DiagnosticArray, "/diagnostics", _RESULTS_DEPTH)
+
+    def _subscribe(self, own: DetectorParameters):
+        compressed = own.image_transport == "compressed"
+        if own.reliable_input:
+            qos = reliable(own.queue_depth)
+        else:
+            qos = QoSProfile(depth=_LIVE_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        return self.create_subscription(
+            CompressedImage if compressed else Image,
+            "image/compressed" if compressed else "image",
+            self._on_image,
+            qos,
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible),
+            qos_overriding_options=overridable_qos(),
+        )
+
+    def _on_change(self, table: Table) -> None:
+        if isinstance(table, Parameters):
+            self._pipeline.parameters = table
+
+    def _on_image(self, message: Image | CompressedImage, info: dict) -> None:
+        # Each sender counts for itself, so numbers tell of losses only while there is one.
+        sequence = info["publication_sequence_number"] if self._image_publishers == 1 else None
+        stamp_ns = messages.stamp_ns(message.header.stamp)
+        self._health.image_received(sequence, has_stamp=stamp_ns != 0)
+        if self._health.enabled:
+            item = (message, time.monotonic())
+            self._health.dropped(self._inbox.put(item, len(message.data)))
+
+    def _on_incompatible(self, event) -> None:
+        policy = qos_policy_name_from_kind(event.last_policy_kind)
+        self.get_logger().warning(self._health.incompatible_qos(policy))
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._reset_wanted = "reset asked for"
+        response.success, response.message = True, "the next frame starts afresh"
+        return response
+
+    def _on_enable(self, request: SetBool.Request, response: SetBool.Response):
+        if request.data and not self._health.enabled:
+            self._reset_wanted = "it was disabled"
+        self._health.enabled = request.data
+        response.success = True
+        response.message = "images are processed" if request.data else "images are ignored"
+        return response
+
+    def _work(self) -> None:
+        while (item := self._inbox.get()) is not None:
+            message, received_s = item
+            try:
+                self._answer(message, received_s)
+            # Nothing that is drawn or sent may end the thread, and with it all answers.
+            except Exception:  # noqa: BLE001
+                if not self.context.ok():
+                    return
+                self.get_logger().error(traceback.format_exc())
+
+    def _answer(self, message: Image | CompressedImage, received_s: float) -> None:
+        if self._reset_wanted:
+            self._pipeline.reset(self._reset_wanted)
+            self._reset_wanted = ""
+        scale = self._settings[DetectorParameters].marker_scale
+        try:
+            image = messages.image_array(message)
+            result = self._pipeline.process(image, messages.stamp_ns(message.header.stamp))
+        except (EncodingError, ImageError) as error:
+            self._fail(message.header, str(error))
+        # Whatever an image does to the stages, it must not take the node down.
+        except Exception as error:  # noqa: BLE001
+            self.get_logger().error(traceback.format_exc())
+            self._pipeline.reset("an error in the frame before")
+            self._fail(message.header, f"{type(error).__name__}: {error}")
+        else:
+            self._publish(message.header, image, result, scale)
+            self._health.processed(result, time.monotonic() - received_s)
+
+    def _fail(self, header: Header, why: str) -> None:
+        """Answer an image that could not be processed: nothing found, and nothing stale left."""
+        self._health.failed(why)
+        self.get_logger().warning(
+            f"image not processed: {why}", throttle_duration_sec=_WARN_EVERY_S
+        )
+        none = np.zeros(0, DETECTION_DTYPE)
+        self._detections.publish(messages.detections_cloud(header, none))
+        self._motion.publish(messages.star_field_vector(header, None))
+        self._markers.publish(messages.no_flow_markers(header))
+
+    def _publish(
+        self, header: Header, image: np.ndarray, result: FrameResult, scale: float
+    ) -> None:
+        self._detections.publish(messages.detections_cloud(header, result.detections))
+        self._motion.publish(messages.star_field_vector(header, result))
+        if self._markers.get_subscription_count():
+            self._markers.publish(messages.flow_markers(header, result, scale))
+        if self._annotated.get_subscription_count():
+            picture = report.annotate(image, result, scale=scale)
+            self._annotated.publish(messages.image_message(header, picture))
+
+    def _publish_diagnostics(self) -> None:
+        self._image_publishers = self.count_publishers(self._images.topic_name)
+        timeout_s = self._settings[DetectorParameters].no_image_timeout_s
+        self._say_aloud(timeout_s)
+        status = messages.diagnostic(
+            f"{self.get_fully_qualified_name()}: detection",
+            self._health.problems(self._image_publishers, timeout_s),
+            self._health.summary(),
+            self._health.values(),
+        )
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(array)
+
+    def _say_aloud(self, timeout_s: float) -> None:
+        """Log what a user must know who does not watch ``/diagnostics``."""
+        silent = self._health.enabled and self._health.silence_s() > timeout_s
+        if silent and not self._said_silence:
+            self.get_logger().warning(self._health.silence(self._image_publishers))
+        self._said_silence = silent
+        if losses := self._health.losses():
+            self.get_logger().warning(losses, throttle_duration_sec=_WARN_EVERY_S)
+
+
+def main() -> int:
+    """Run the node; return the exit code."""
+    parser = argparse.ArgumentParser(
+        "detector",
+        description="Detect satellites in a camera's images.",
+        epilog="Parameters: --ros-args -p NAME:=VALUE; the README has a table of them.",
+    )
+    return run(lambda stop, options: Detector(), parser)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,186 @@
+"""What the detector knows of its own state: counts, rates, and what is wrong in words.
+
+The detector tells it what happens; ``/diagnostics`` shows what it makes of it.  It imports no ROS.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from typing import Any
+
+from ofsat_ros.pipeline import FrameResult
+
+# s; a loss is a warning for so long, and rates are taken over it.
+_RECENT_S = 10.0
+# More of the newest frames are not needed for a rate.
+_FRAMES_IN_RATE = 200
+
+
+class Health:
+    """State of a detector; its methods are told what happens, `problems` and `values` read it.
+
+    Parameters
+    ----------
+    topic : str
+        Image topic, as resolved.
+    reliable : bool
+        Whether every frame is to be processed.
+    profile : str
+        Path of the Fast DDS profile for large images.
+    """
+
+    def __init__(self, topic: str, reliable: bool, profile: str) -> None:
+        self._topic = topic
+        self._reliable = reliable
+        self._profile = profile
+        self._counts = dict.fromkeys(("received", "processed", "failed", "dropped", "lost"), 0)
+        self._last_image_s = time.monotonic()
+        self._last_loss_s = self._last_drop_s = -_RECENT_S
+        self._last_sequence: int | None = None
+        self._processed_at: deque[float] = deque(maxlen=_FRAMES_IN_RATE)
+        self._latency_s = float("nan")
+        self._failure = ""
+        self._incompatible = ""
+        self._zero_stamp = False
+        self._result: FrameResult | None = None
+        self.enabled = True
+
+    def image_received(self, sequence: int | None, has_stamp: bool) -> None:
+        """Count an image; `sequence` is its sender's number of it, None if that means nothing."""
+        now = time.monotonic()
+        last, self._last_sequence = self._last_sequence, sequence
+        # A smaller number is a sender that began anew.
+        if last is not None and sequence is not None and sequence > last + 1:
+            self._counts["lost"] += sequence - last - 1
+            self._last_loss_s = now
+        self._counts["received"] += 1
+        self._last_image_s = now
+        self._zero_stamp = not has_stamp
+
+    def dropped(self, count: int) -> None:
+        """Count frames that a newer one replaced before they were processed."""
+        if count:
+            self._counts["dropped"] += count
+            self._last_drop_s = time.monotonic()
+
+    def processed(self, result: FrameResult, latency_s: float) -> None:
+        """Take note of a frame's result and of the time from its receipt to its answer."""
+        self._counts["processed"] += 1
+        self._processed_at.append(time.monotonic())
+        self._latency_s = latency_s
+        self._result = result
+        self._failure = ""
+
+    def failed(self, why: str) -> None:
+        """Take note of a frame that could not be processed."""
+        self._counts["failed"] += 1
+        self._failure = why
+
+    def incompatible_qos(self, policy: str) -> str:
+        """Take note of a publisher that cannot be heard; return what to say about it."""
+        if policy == "RELIABILITY":
+            remedy = (
+                "this detector asks for reliable delivery, the publisher is best effort: start the"
+                " detector with reliable_input:=false, or make the publisher reliable"
+            )
+        else:
+            remedy = (
+                f"they differ in {policy}: set qos_overrides.{self._topic}.subscription."
+                f"{policy.lower()} to what the publisher offers"
+            )
+        self._incompatible = f"a publisher of {self._topic} cannot be heard: {remedy}"
+        return self._incompatible
+
+    def silence_s(self) -> float:
+        """Return the time since the last image, or since the start, s."""
+        return time.monotonic() - self._last_image_s
+
+    def silence(self, publishers: int) -> str:
+        """Return what to say when no image comes, with the remedy."""
+        if publishers == 0:
+            why = f"nobody publishes it; remap {_relative(self._topic)} to the camera's"
+        else:
+            why = (
+                f"{publishers} publish it: paused, ended, of incompatible QoS, or its images do"
+                f" not fit its shared memory; {self._remedy_at_sender()}"
+            )
+        return f"no image on {self._topic} for {self.silence_s():.0f} s: {why}"
+
+    def losses(self) -> str:
+        """Return what to say about frames lost a short while ago; empty if there are none."""
+        if time.monotonic() - self._last_loss_s > _RECENT_S:
+            return ""
+        lost = self._counts["lost"]
+        if self._reliable:
+            return (
+                f"{lost} frames lost: they come faster than they are processed; slow the sender"
+                " down, or raise queue_depth"
+            )
+        return f"{lost} frames lost on the way: {self._remedy_at_sender()}"
+
+    def problems(self, publishers: int, timeout_s: float) -> list[str]:
+        """Return what is wrong now, in words; empty if nothing is."""
+        drops = time.monotonic() - self._last_drop_s <= _RECENT_S
+        silent = self.enabled and self.silence_s() > timeout_s
+        found = [
+            "" if self.enabled else "disabled by ~/enable: images are ignored",
+            self.silence(publishers) if silent else "",
+            self._incompatible if not self._counts["received"] else "",
+            self.losses(),
+            f"slower than the camera: {self._counts['dropped']} frames dropped" if drops else "",
+            f"the last frame could not be processed: {self._failure}" if self._failure else "",
+            "images bear no stamp, without which there is no velocity: have the driver set"
+            " header.stamp"
+            if self._zero_stamp
+            else "",
+        ]
+        return [problem for problem in found if problem]
+
+    def summary(self) -> str:
+        """Return the state in words when nothing is wrong."""
+        if self._result is None:
+            return "waiting for images"
+        return self._result.reason or f"{len(self._result.detections)} RSOs"
+
+    def values(self) -> dict[str, Any]:
+        """Return names and values for ``/diagnostics``."""
+        values: dict[str, Any] = {f"frames_{key}": count for key, count in self._counts.items()}
+        values |= {"rate_hz": self._rate_hz(), "latency_s": self._latency_s}
+        result = self._result
+        if result is None:
+            return values
+        field = result.star_field
+        moving = field is not None
+        return values | {
+            "objects": len(result.objects),
+            "stars": field.star_count if moving else 0,
+            "rso_detections": len(result.detections),
+            "noise_dn": result.noise,
+            "background_dn": result.background,
+            "threshold_dn": result.threshold,
+            "star_motion_x_px_s": field.displacement[0] / result.dt_s if moving else float("nan"),
+            "star_motion_y_px_s": field.displacement[1] / result.dt_s if moving else float("nan"),
+            "star_rotation_rad_s": field.rotation / result.dt_s if moving else float("nan"),
+            "star_residual_px": field.residual_px if moving else float("nan"),
+            "frame_interval_s": result.dt_s,
+            "processing_s": sum(result.seconds.values()),
+            "nothing_detected_because": result.reason,
+        }
+
+    def _rate_hz(self) -> float:
+        now = time.monotonic()
+        recent = [at for at in self._processed_at if now - at <= _RECENT_S]
+        if len(recent) < 2 or recent[-1] == recent[0]:
+            return 0.0
+        return (len(recent) - 1) / (recent[-1] - recent[0])
+
+    def _remedy_at_sender(self) -> str:
+        return (
+            "start the camera driver with"
+            f" FASTRTPS_DEFAULT_PROFILES_FILE={self._profile} (the sender's setting decides)"
+        )
+
+
+def _relative(topic: str) -> str:
+    return "image/compressed" if topic.endswith("/compressed") else "image"

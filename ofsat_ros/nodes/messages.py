@@ -1,0 +1,324 @@
+"""ROS messages from and to the package's arrays: conversion, and nothing else.
+
+It stands between the nodes and everything that runs without ROS.  Every message made here carries
+the header it is given, so that a result bears its image's stamp and frame.
+"""
+
+from __future__ import annotations
+
+import array
+import struct
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Point, Vector3Stamped
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2, PointField
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from ofsat_ros.detection import DETECTION_DTYPE
+from ofsat_ros.images import decode_compressed, decode_image
+from ofsat_ros.pipeline import FrameResult
+
+_NS = 1_000_000_000
+
+# Where the first header lies in a serialized message: after CDR's own header, and in an array
+# after its length.
+HEADER_AT, FIRST_MARKER_AT = 4, 8
+
+# One row of rso_detections and rso_truth.  Aligned as a C struct, for readers in C++.
+CLOUD_DTYPE = np.dtype(
+    [(name, "f4") for name in ("x", "y", "z")]
+    + [(name, "f8") for name in ("u", "v", "u_rate", "v_rate", "rel_u_rate", "rel_v_rate")]
+    + [(name, "f8") for name in ("sigma_u", "sigma_v", "snr", "flux", "length", "angle")]
+    + [("id", "u4"), ("ra", "f8"), ("dec", "f8"), ("status", "u1")],
+    align=True,
+)
+_POINT_TYPES = {
+    "i1": PointField.INT8,
+    "u1": PointField.UINT8,
+    "i2": PointField.INT16,
+    "u2": PointField.UINT16,
+    "i4": PointField.INT32,
+    "u4": PointField.UINT32,
+    "f4": PointField.FLOAT32,
+    "f8": PointField.FLOAT64,
+}
+_DTYPES = {code: name for name, code in _POINT_TYPES.items()}
+_FIELDS = [
+    PointField(name=name, offset=offset, datatype=_POINT_TYPES[dtype.str[1:]], count=1)
+    for name, (dtype, offset) in CLOUD_DTYPE.fields.items()
+]
+_DETECTION_FIELDS = {
+    "u": "x",
+    "v": "y",
+    "u_rate": "vx",
+    "v_rate": "vy",
+    "rel_u_rate": "rel_vx",
+    "rel_v_rate": "rel_vy",
+    "sigma_u": "sigma_x",
+    "sigma_v": "sigma_y",
+    "snr": "snr",
+    "flux": "flux",
+    "length": "length",
+    "angle": "angle",
+    "id": "track_id",
+    "ra": "ra",
+    "dec": "dec",
+    "status": "status",
+}
+
+_BLUE = ColorRGBA(r=0.2, g=0.5, b=1.0, a=1.0)
+_RED = ColorRGBA(r=1.0, g=0.15, b=0.1, a=1.0)
+# px; half the side of the box around an RSO, beyond half its streak.
+_BOX_MARGIN_PX = 8.0
+_LINE_WIDTH_PX = 1.0
+_TEXT_HEIGHT_PX = 12.0
+
+
+def stamp_ns(stamp: Time) -> int:
+    """Return a message's time in ns."""
+    return stamp.sec * _NS + stamp.nanosec
+
+
+def time_message(ns: int) -> Time:
+    """Return a time in ns as a message."""
+    return Time(sec=ns // _NS, nanosec=ns % _NS)
+
+
+def header_stamp_ns(data: bytes | memoryview, header_at: int = HEADER_AT) -> int:
+    """Return the stamp of a serialized message whose header lies at an offset, ns."""
+    # The second byte tells the byte order of what follows.
+    sec, nanosec = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, header_at)
+    return sec * _NS + nanosec
+
+
+def image_array(message: Image | CompressedImage) -> np.ndarray:
+    """Return the luminance of an image message, without a copy where its layout allows it.
+
+    Returns
+    -------
+    ndarray, shape (height, width), uint8, uint16 or float32
+
+    Raises
+    ------
+    ofsat_ros.images.EncodingError
+        If the image cannot be decoded.
+    """
+    if isinstance(message, CompressedImage):
+        return decode_compressed(message.data, message.format)
+    return decode_image(
+        message.data,
+        message.encoding,
+        message.width,
+        message.height,
+        message.step,
+        message.is_bigendian,
+    )
+
+
+def image_message(header: Header, image: np.ndarray) -> Image:
+    """Return an image as a message.
+
+    Parameters
+    ----------
+    header : Header
+    image : ndarray, shape (height, width) or (height, width, 3)
+        uint8 or uint16; three channels are uint8 blue, green, red.
+    """
+    if image.ndim == 3:
+        encoding = "bgr8"
+    else:
+        encoding = {"uint8": "mono8", "uint16": "mono16"}[image.dtype.name]
+    return Image(
+        header=header,
+        height=image.shape[0],
+        width=image.shape[1],
+        encoding=encoding,
+        is_bigendian=int(sys.byteorder == "big"),
+        step=image[0].nbytes,
+        data=_bytes_array(image),
+    )
+
+
+def cloud_rows(count: int) -> np.ndarray:
+    """Return `count` rows of CLOUD_DTYPE in which everything is unknown."""
+    rows = np.zeros(count, CLOUD_DTYPE)
+    for name in CLOUD_DTYPE.names:
+        if CLOUD_DTYPE[name].kind == "f":
+            rows[name] = np.nan
+    return rows
+
+
+def cloud_message(header: Header, rows: np.ndarray) -> PointCloud2:
+    """Return rows of CLOUD_DTYPE as a cloud of one row; an empty one is a message, too."""
+    known = all(np.isfinite(rows[axis]).all() for axis in "xyz")
+    return PointCloud2(
+        header=header,
+        height=1,
+        width=len(rows),
+        fields=_FIELDS,
+        is_bigendian=sys.byteorder == "big",
+        point_step=CLOUD_DTYPE.itemsize,
+        row_step=CLOUD_DTYPE.itemsize * len(rows),
+        data=_bytes_array(rows),
+        is_dense=known,
+    )
+
+
+def detections_cloud(header: Header, detections: np.ndarray) -> PointCloud2:
+    """Return the RSO detections of a frame (DETECTION_DTYPE) as ``rso_detections``.
+
+    Lines of sight are NaN: there is no calibration.
+    """
+    rows = cloud_rows(len(detections))
+    for field, column in _DETECTION_FIELDS.items():
+        rows[field] = detections[column]
+    return cloud_message(header, rows)
+
+
+def detections_array(cloud: PointCloud2) -> np.ndarray:
+    """Return the detections of an ``rso_detections`` message as DETECTION_DTYPE.
+
+    Columns that the message does not carry are 0.
+    """
+    points = cloud_array(cloud)
+    rows = np.zeros(len(points), DETECTION_DTYPE)
+    for field, column in _DETECTION_FIELDS.items():
+        rows[column] = points[field]
+    return rows
+
+
+def cloud_array(cloud: PointCloud2) -> np.ndarray:
+    """Return the points of any cloud as a structured array, one field per field."""
+    order = ">" if cloud.is_bigendian else "<"
+    dtype = np.dtype(
+        {
+            "names": [field.name for field in cloud.fields],
+            "formats": [order + _DTYPES[field.datatype] for field in cloud.fields],
+            "offsets": [field.offset for field in cloud.fields],
+            "itemsize": cloud.point_step,
+        }
+    )
+    return np.frombuffer(cloud.data, dtype, cloud.width * cloud.height)
+
+
+def no_flow_markers(header: Header) -> MarkerArray:
+    """Return the array that clears what the frame before has drawn."""
+    return MarkerArray(markers=[Marker(header=header, action=Marker.DELETEALL)])
+
+
+def flow_markers(header: Header, result: FrameResult, scale: float) -> MarkerArray:
+    """Return what a frame shows, to be drawn over its image; coordinates are px, z is 0.
+
+    Every array begins by deleting what was drawn before.  Namespaces: ``star_flow`` (blue) and
+    ``rso_flow`` (red), each one LINE_LIST of vectors that begin where the object is and are one
+    frame's displacement times `scale`; ``rso_boxes`` and ``rso_ids``, one marker per detection.
+
+    Parameters
+    ----------
+    header : Header
+    result : FrameResult
+    scale : float
+        Length of a vector, in frames of motion.
+    """
+    array_ = no_flow_markers(header)
+    stars = _star_flow(result)
+    start, step = result.flow.position[stars], result.flow.displacement[stars]
+    array_.markers += _vectors(header, "star_flow", _BLUE, start, step * scale)
+    rows = result.detections
+    start = np.column_stack([rows["x"], rows["y"]])
+    step = np.column_stack([rows["vx"], rows["vy"]]) * result.dt_s
+    array_.markers += _vectors(header, "rso_flow", _RED, start, step * scale)
+    for number, row in enumerate(rows):
+        array_.markers += _box(header, number, row)
+    return array_
+
+
+def star_field_vector(header: Header, result: FrameResult | None) -> Vector3Stamped:
+    """Return the motion of the star field: x, y px/s at the image's centre, z rad/s.
+
+    NaN where it is unknown, or for a frame without a result.
+    """
+    message = Vector3Stamped(header=header)
+    rate = np.full(3, np.nan)
+    if result is not None and result.star_field is not None:
+        field = result.star_field
+        rate = np.array([*field.displacement, field.rotation]) / result.dt_s
+    message.vector.x, message.vector.y, message.vector.z = rate.tolist()
+    return message
+
+
+def diagnostic(
+    name: str, problems: list[str], summary: str, values: Mapping[str, Any]
+) -> DiagnosticStatus:
+    """Return a status: WARN with the problems if there are any, else OK with the summary."""
+    return DiagnosticStatus(
+        level=DiagnosticStatus.WARN if problems else DiagnosticStatus.OK,
+        name=name,
+        message="; ".join(problems) or summary,
+        values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()],
+    )
+
+
+def _text(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _bytes_array(pixels: np.ndarray) -> array.array:
+    """Return an array's bytes as the one type that rclpy takes over without a loop."""
+    data = array.array("B")
+    # A view, not tobytes(): one copy less.  memoryview.cast refuses arrays without elements.
+    if pixels.size:
+        data.frombytes(memoryview(np.ascontiguousarray(pixels).reshape(-1).view(np.uint8)))
+    return data
+
+
+def _star_flow(result: FrameResult) -> np.ndarray:
+    """Rows of the flow that are the star field's: the fit's inliers, or all valid ones."""
+    stars = result.flow.valid.copy()
+    if result.star_field is not None:
+        stars &= result.star_field.inliers
+    flagged = result.detections["flow_index"]
+    stars[flagged[flagged >= 0]] = False
+    return stars
+
+
+def _marker(header: Header, namespace: str, number: int, kind: int, color: ColorRGBA) -> Marker:
+    marker = Marker(header=header, ns=namespace, id=number, type=kind, color=color)
+    marker.pose.orientation.w = 1.0
+    return marker
+
+
+def _vectors(
+    header: Header, namespace: str, color: ColorRGBA, start: np.ndarray, step: np.ndarray
+) -> list[Marker]:
+    """One LINE_LIST; none if there is no vector, which viewers complain about."""
+    if not len(start):
+        return []
+    marker = _marker(header, namespace, 0, Marker.LINE_LIST, color)
+    marker.scale.x = _LINE_WIDTH_PX
+    ends = np.stack([start, start + step], axis=1).reshape(-1, 2)
+    marker.points = [Point(x=x, y=y) for x, y in ends.tolist()]
+    return [marker]
+
+
+def _box(header: Header, number: int, row: np.void) -> list[Marker]:
+    """A square around a detection, and its id above; an unconfirmed one has none."""
+    u, v = float(row["x"]), float(row["y"])
+    half = _BOX_MARGIN_PX + float(np.nan_to_num(row["length"])) / 2
+    corners = [(u + half * i, v + half * j) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    box = _marker(header, "rso_boxes", number, Marker.LINE_LIST, _RED)
+    box.scale.x = _LINE_WIDTH_PX
+    for side in range(4):
+        for x, y in (corners[side], corners[(side + 1) % 4]):
+            box.points.append(Point(x=x, y=y))
+    text = _marker(header, "rso_ids", number, Marker.TEXT_VIEW_FACING, _RED)
+    text.scale.z = _TEXT_HEIGHT_PX
+    text.pose.position.x, text.pose.position.y = u, v - half - _TEXT_HEIGHT_PX / 2
+    text.text = f"{row['track_id'] or '?'}  SNR {row['snr']:.0f}"
+    return [box, text]

@@ -1,0 +1,247 @@
+"""The recorder node: what a detector finds, as a table on the screen and as files.
+
+Writes into a folder: ``detections.csv``, ``frame_*.png`` (every n-th annotated image), and
+``results``, a bag of the results as they were received.  All are whole after Ctrl-C, too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import threading
+import time
+from collections import deque
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from geometry_msgs.msg import Vector3Stamped
+from rclpy.clock import Clock, ClockType
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import Image, PointCloud2
+from visualization_msgs.msg import MarkerArray
+
+from ofsat_ros.images import encode_png
+from ofsat_ros.nodes import messages
+from ofsat_ros.nodes.ros_parameters import NodeParameters
+from ofsat_ros.nodes.runtime import StartError, overridable_qos, reliable, run
+from ofsat_ros.parameters import RecorderParameters
+from ofsat_ros.recordings import BagWriter, RecordingError
+from ofsat_ros.results import DETECTION_COLUMNS, DETECTIONS, detection_lines
+
+BAG, PICTURE = "results", "frame_{:06d}.png"
+HEARING = "hearing a detector"  # printed as soon as this is so
+
+# Results that may wait while a picture is written.
+_DEPTH = 1000
+_PICTURES_DEPTH = 5
+# Consecutive frames without detection that share one line of the table.
+_QUIET_FRAMES = 10
+# What else belongs to the last frame comes a moment after its detections.
+_LAST_RESULTS_S = 1.0
+
+
+class Recorder(Node):
+    """Prints and records results; sets `stop` after the wanted count of frames.
+
+    Parameters
+    ----------
+    stop : threading.Event
+        Set by the recorder when it has all frames it was asked for.
+    context : Context, optional
+        ROS context; default: the process's.
+
+    Raises
+    ------
+    ofsat_ros.parameters.ParameterError
+        If a start parameter is bad.
+    StartError
+        If the output folder holds something else, or cannot be written.
+    """
+
+    def __init__(self, stop: threading.Event, context: Context | None = None) -> None:
+        super().__init__("recorder", context=context)
+        self._stop = stop
+        self._own = NodeParameters(self, RecorderParameters())[RecorderParameters]
+        self._folder = Path(self._own.output)
+        try:
+            _claim(self._folder)
+            self._bag = BagWriter(self._folder / BAG, force=True)
+            self._csv = open(self._folder / DETECTIONS, "w", encoding="utf-8")  # noqa: SIM115
+            self._csv.write(",".join(DETECTION_COLUMNS) + "\n")
+        except (OSError, RecordingError) as error:
+            raise StartError(str(error)) from error
+        self._table = _Table()
+        self._frames = self._detections = self._pictures = 0
+        self._recent: deque[tuple[int, int]] = deque(maxlen=_DEPTH)  # stamp, frame
+        self._last_frame_s = math.inf
+        self._hears = False
+        # Callbacks and close() come from two threads.
+        self._lock = threading.Lock()
+        self._closed = False
+        self._subscribe()
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(0.1, self._watch, clock=steady)
+        self.get_logger().info(f"recording into {self._folder}")
+
+    def close(self) -> None:
+        """Finish the files and say what is in them."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            self._table.end()
+            self._csv.close()
+            self._bag.close()
+        _say(
+            f"{self._frames} frames, {self._detections} RSO detections; {DETECTIONS},"
+            f" {self._pictures} pictures and the bag {BAG} are in {self._folder}"
+        )
+
+    def _subscribe(self) -> None:
+        def subscribe(kind: type, topic: str, callback, depth: int, raw: bool) -> str:
+            qos, override = reliable(depth), overridable_qos()
+            subscription = self.create_subscription(
+                kind, topic, callback, qos, raw=raw, qos_overriding_options=override
+            )
+            return subscription.topic_name
+
+        # Raw: the bag is to hold what was received.
+        self._cloud_topic = subscribe(
+            PointCloud2, "rso_detections", self._on_detections, _DEPTH, True
+        )
+        self._motion_topic = subscribe(
+            Vector3Stamped, "star_field_motion", self._on_motion, _DEPTH, True
+        )
+        self._marker_topic = subscribe(MarkerArray, "flow_markers", self._on_markers, _DEPTH, True)
+        if self._own.picture_every:
+            subscribe(Image, "image_annotated", self._on_picture, _PICTURES_DEPTH, False)
+
+    def _on_detections(self, data: bytes) -> None:
+        cloud = deserialize_message(data, PointCloud2)
+        stamp, rows = messages.stamp_ns(cloud.header.stamp), messages.detections_array(cloud)
+        with self._lock:
+            if self._closed or self._is_complete():
+                return
+            self._write(self._cloud_topic, "sensor_msgs/msg/PointCloud2", data, stamp)
+            self._csv.writelines(detection_lines(stamp, self._frames, rows))
+            self._csv.flush()
+            self._table.add(stamp, self._frames, rows)
+            self._recent.append((stamp, self._frames))
+            self._frames += 1
+            self._detections += len(rows)
+            self._last_frame_s = time.monotonic()
+
+    def _on_motion(self, data: bytes) -> None:
+        with self._lock:
+            stamp = messages.header_stamp_ns(data)
+            self._write(self._motion_topic, "geometry_msgs/msg/Vector3Stamped", data, stamp)
+
+    def _on_markers(self, data: bytes) -> None:
+        with self._lock:
+            # The array's length comes first, then the first marker's header.
+            stamp = messages.header_stamp_ns(data, messages.FIRST_MARKER_AT)
+            self._write(self._marker_topic, "visualization_msgs/msg/MarkerArray", data, stamp)
+
+    def _on_picture(self, image: Image) -> None:
+        frame = dict(self._recent).get(messages.stamp_ns(image.header.stamp))
+        if frame is None or frame % self._own.picture_every:
+            return
+        pixels = np.frombuffer(image.data, np.uint8).reshape(image.height, image.width, 3)
+        png = encode_png(pixels)
+        with self._lock:
+            if not self._closed:
+                (self._folder / PICTURE.format(frame)).write_bytes(png)
+                self._pictures += 1
+
+    def _write(self, topic: str, msgtype: str, data: bytes, stamp: int) -> None:
+        """Write into the bag, at the image's time: it then plays beside the recording."""
+        if not self._closed:
+            self._bag.write(topic, msgtype, data, stamp or time.time_ns())
+
+    def _is_complete(self) -> bool:
+        return 0 < self._own.frames <= self._frames
+
+    def _watch(self) -> None:
+        """Say when a detector is there; end when all is recorded."""
+        if not self._hears and self.count_publishers(self._cloud_topic):
+            self._hears = True
+            _say(HEARING)
+        if self._is_complete() and time.monotonic() - self._last_frame_s > _LAST_RESULTS_S:
+            self._stop.set()
+
+
+class _Table:
+    """The detections, printed for a person: a line for each, one for many frames without."""
+
+    def __init__(self) -> None:
+        self._quiet: list[int] = []
+        self._begun = False
+
+    def add(self, stamp: int, frame: int, rows: np.ndarray) -> None:
+        """Print the detections of a frame."""
+        if not self._begun:
+            self._begun = True
+            _say(
+                f"{'time (UTC)':>23} {'frame':>6} {'id':>4} {'x px':>8} {'y px':>8}"
+                f" {'px/s':>8} {'towards':>7} {'px/s vs stars':>13} {'SNR':>7}"
+            )
+        if not len(rows):
+            self._quiet.append(frame)
+            if len(self._quiet) >= _QUIET_FRAMES:
+                self.end()
+            return
+        self.end()
+        when = datetime.fromtimestamp(stamp / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S.%f")[:-3]
+        for row in rows:
+            speed = math.hypot(row["vx"], row["vy"])
+            relative = math.hypot(row["rel_vx"], row["rel_vy"])
+            towards = math.degrees(math.atan2(row["vy"], row["vx"]))
+            _say(
+                f"{when} {frame:6d} {row['track_id'] or '-':>4} {row['x']:8.2f} {row['y']:8.2f}"
+                f" {speed:8.3f} {towards:6.0f}° {relative:13.3f} {row['snr']:7.1f}"
+            )
+
+    def end(self) -> None:
+        """Print the line for the frames without detection so far."""
+        if self._quiet:
+            first, last = self._quiet[0], self._quiet[-1]
+            frames = f"frame {first}" if first == last else f"frames {first} to {last}"
+            _say(f"{'':>23} {frames}: no RSO")
+            self._quiet.clear()
+
+
+def _claim(folder: Path) -> None:
+    """Make the folder, or remove the files that a recorder has left there; else raise."""
+    folder.mkdir(parents=True, exist_ok=True)
+    ours = [folder / DETECTIONS, *folder.glob(PICTURE.replace("{:06d}", "[0-9]*"))]
+    foreign = sorted(p.name for p in folder.iterdir() if p not in [*ours, folder / BAG])
+    if foreign:
+        raise StartError(
+            f"{folder} holds {', '.join(foreign[:3])}, which is not a recorder's: choose another"
+            " folder with -p output:=FOLDER"
+        )
+    for path in ours:
+        path.unlink(missing_ok=True)
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+def main() -> int:
+    """Run the node; return the exit code."""
+    parser = argparse.ArgumentParser(
+        "recorder",
+        description="Print and record what a detector finds.",
+        epilog="Parameters: --ros-args -p NAME:=VALUE; the README has a table of them.",
+    )
+    return run(lambda stop, options: Recorder(stop), parser)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,229 @@
+"""What all nodes share: how a process becomes a node, and how it ends.
+
+`run` is the whole of a node's ``main``: it readies allocator and middleware for large images,
+starts the node, serves its callbacks in one thread, and ends it in order on SIGINT, SIGTERM or
+when the node itself sets its stop event.  `Inbox` hands messages from the callbacks to a node's
+own worker thread, so that a slow frame delays no service, parameter or diagnostic.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import os
+import platform
+import signal
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable
+from importlib import resources
+from typing import Any
+
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions, QoSPolicyKind
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+
+from ofsat_ros.nodes.ros_parameters import refuse_unknown
+from ofsat_ros.parameters import ParameterError
+
+# What the middleware raises in a thread that still works while the node ends.
+MIDDLEWARE_ERRORS = (rclpy_implementation.RCLError, rclpy_implementation.InvalidHandle)
+STARTED_WRONGLY = 2  # exit code; the same as argparse's
+
+_PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+# How long a node's own threads may take to end: signals must end it within a second.
+_PATIENCE_S = 0.5
+
+
+class StartError(Exception):
+    """A node cannot start; the message is one line that says what to do."""
+
+
+class Inbox:
+    """Messages on their way from a callback to a worker thread, in order.
+
+    Parameters
+    ----------
+    depth : int
+        Messages that may always wait.
+    newest_only : bool
+        True: a new message replaces those that wait.  False: none is lost; `put` blocks when
+        `depth` messages and `LIMIT_BYTES` are reached, whichever is later.
+    """
+
+    # The middleware overwrites what is not taken from it in time, without a word; so memory, not
+    # a count of frames, bounds how far a reliable sender may run ahead of the worker.
+    LIMIT_BYTES = 1 << 30
+
+    def __init__(self, depth: int, newest_only: bool) -> None:
+        self._depth = depth
+        self._newest_only = newest_only
+        self._items: deque[tuple[Any, int]] = deque()
+        self._bytes = 0
+        self._closed = False
+        self._changed = threading.Condition()
+
+    def put(self, item: Any, size: int) -> int:
+        """Add a message of `size` bytes; return how many waiting ones it replaced."""
+        with self._changed:
+            replaced = 0
+            if self._newest_only:
+                replaced = len(self._items)
+                self._items.clear()
+                self._bytes = 0
+            else:
+                self._changed.wait_for(lambda: self._closed or self._has_room(size))
+            self._items.append((item, size))
+            self._bytes += size
+            self._changed.notify_all()
+            return replaced
+
+    def get(self) -> Any | None:
+        """Wait for the next message and return it; None once closed."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or self._items)
+            if self._closed:
+                return None
+            item, size = self._items.popleft()
+            self._bytes -= size
+            self._changed.notify_all()
+            return item
+
+    def close(self) -> None:
+        """Release whoever waits; what is inside is dropped."""
+        with self._changed:
+            self._closed = True
+            self._items.clear()
+            self._changed.notify_all()
+
+    def _has_room(self, size: int) -> bool:
+        return len(self._items) < self._depth or self._bytes + size <= self.LIMIT_BYTES
+
+
+def overridable_qos() -> QoSOverridingOptions:
+    """Let parameters ``qos_overrides.<topic>.<publisher|subscription>.*`` change a QoS."""
+    kinds = QoSPolicyKind
+    return QoSOverridingOptions((kinds.HISTORY, kinds.DEPTH, kinds.RELIABILITY, kinds.DURABILITY))
+
+
+def reliable(depth: int) -> QoSProfile:
+    """QoS of a publisher or subscription that loses nothing; each needs its own."""
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE)
+
+
+def run(
+    make_node: Callable[[threading.Event, argparse.Namespace], Node],
+    parser: argparse.ArgumentParser,
+) -> int:
+    """Run a node until a signal or the node itself ends it.
+
+    Parameters
+    ----------
+    make_node : callable
+        Called with the stop event, which the node may set, and the parsed arguments.  The node
+        has a ``close()`` that ends its own threads and flushes its files within half a second.
+    parser : argparse.ArgumentParser
+        For the arguments that are not ROS's.
+
+    Returns
+    -------
+    int
+        Exit code: 0 after an orderly end, 1 after a failure, 2 if it could not start.
+    """
+    stop = threading.Event()
+    # Ours instead of rclpy's or Python's: no exception then breaks into whatever runs.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    prepare_for_large_images()
+    node = None
+    try:
+        options = parser.parse_args(remove_ros_args(sys.argv)[1:])
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        node = make_node(stop, options)
+        refuse_unknown(node)
+    except (ParameterError, StartError, RuntimeError) as error:
+        sys.stderr.write(f"{parser.prog}: {_one_line(error)}\n")
+        if node is not None:
+            node.close()
+        rclpy.try_shutdown()
+        return STARTED_WRONGLY
+    return _serve(node, stop)
+
+
+def prepare_for_large_images() -> None:
+    """Ready allocator and middleware for images of megabytes; call before ``rclpy.init``."""
+    _keep_large_buffers()
+    _use_packaged_profile()
+
+
+def _serve(node: Node, stop: threading.Event) -> int:
+    failures: list[BaseException] = []
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+
+    def spin() -> None:
+        try:
+            while not stop.is_set():
+                executor.spin_once()
+        except ExternalShutdownException:
+            pass
+        # Handed to the main thread, which raises it.
+        except Exception as error:  # noqa: BLE001
+            if not stop.is_set():
+                failures.append(error)
+        finally:
+            stop.set()
+
+    thread = threading.Thread(target=spin, name="executor", daemon=True)
+    thread.start()
+    stop.wait()
+    node.close()
+    executor.create_task(lambda: None)  # the only thing that makes spin_once return
+    thread.join(_PATIENCE_S)
+    executor.shutdown()
+    # Without this the middleware leaves its shared memory behind.
+    node.destroy_node()
+    rclpy.try_shutdown()
+    if failures:
+        raise failures[0]
+    exit_code = getattr(node, "exit_code", 0)
+    if any(other.daemon and other.is_alive() for other in threading.enumerate()):
+        # It is inside a long native call; Python's own end would pull the ground from under it.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(exit_code)
+    return exit_code
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def _keep_large_buffers() -> None:
+    """Have glibc keep freed megabytes instead of mapping them afresh for every image."""
+    if platform.libc_ver()[0] != "glibc":
+        return
+    mallopt = ctypes.CDLL(None).mallopt
+    trim_threshold, mmap_max, arena_max = -1, -4, -8  # malloc.h
+    mallopt(mmap_max, 0)
+    mallopt(trim_threshold, 2_000_000_000)
+    mallopt(arena_max, 1)
+
+
+def _use_packaged_profile() -> None:
+    """Point Fast DDS at the profile for large images, unless the user chose for himself."""
+    if os.environ.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp") != "rmw_fastrtps_cpp":
+        return
+    if not any(os.environ.get(name) for name in _PROFILE_VARIABLES):
+        os.environ[_PROFILE_VARIABLES[0]] = profile_path()
+
+
+def profile_path() -> str:
+    """Return where the Fast DDS profile for large images lies."""
+    return str(resources.files("ofsat_ros").joinpath("data/fastdds_large_images.xml"))

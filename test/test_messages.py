@@ -1,0 +1,208 @@
+"""Conversion between arrays and ROS messages."""
+
+import sys
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2, PointField
+from std_msgs.msg import Header
+from visualization_msgs.msg import Marker
+
+from ofsat_ros.detection import DETECTION_DTYPE
+from ofsat_ros.images import EncodingError, encode_png
+from ofsat_ros.nodes import messages
+from ofsat_ros.optical_flow import Flow
+from ofsat_ros.pipeline import FrameResult
+
+HEADER = Header(stamp=messages.time_message(1_700_000_000_123_456_789), frame_id="optical")
+
+
+def detections(count: int = 3, seed: int = 0) -> np.ndarray:
+    random = np.random.default_rng(seed)
+    rows = np.zeros(count, DETECTION_DTYPE)
+    for name in DETECTION_DTYPE.names:
+        if DETECTION_DTYPE[name].kind == "f":
+            rows[name] = random.uniform(1, 100, count)
+    rows["track_id"], rows["status"], rows["flow_index"] = np.arange(count), 1, -1
+    return rows
+
+
+def result(rows: np.ndarray, flow: Flow | None = None) -> FrameResult:
+    about = {"dt_s": 0.5, "detections": rows, "flow": flow or Flow.empty()}
+    return FrameResult(stamp_ns=0, frame=1, shape=(100, 100), **about)
+
+
+def flow(count: int) -> Flow:
+    random = np.random.default_rng(1)
+    position, step = random.uniform(0, 100, (2, count, 2))
+    index = np.arange(count)
+    return Flow.of_vectors(position, step, np.ones((count, 2)), np.ones(count, bool), index)
+
+
+@pytest.mark.parametrize("ns", [0, 1, 999_999_999, 1_700_000_000_123_456_789])
+def test_times_keep_every_nanosecond(ns):
+    assert messages.stamp_ns(messages.time_message(ns)) == ns
+
+
+def test_stamp_is_read_from_serialized_messages():
+    expected = messages.stamp_ns(HEADER.stamp)
+    assert messages.header_stamp_ns(serialize_message(Image(header=HEADER))) == expected
+    assert messages.header_stamp_ns(serialize_message(CompressedImage(header=HEADER))) == expected
+    array = messages.no_flow_markers(HEADER)
+    found = messages.header_stamp_ns(serialize_message(array), messages.FIRST_MARKER_AT)
+    assert found == expected
+
+
+def test_stamp_is_read_in_either_byte_order():
+    big = bytes([0, 0, 0, 0]) + (7).to_bytes(4, "big") + (9).to_bytes(4, "big")
+    assert messages.header_stamp_ns(big) == 7_000_000_009
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_image_there_and_back(dtype):
+    pixels = np.arange(35, dtype=dtype).reshape(5, 7) * 7
+    message = messages.image_message(HEADER, pixels)
+    assert message.header == HEADER
+    assert (message.height, message.width, message.step) == (5, 7, 7 * pixels.itemsize)
+    back = messages.image_array(message)
+    assert back.dtype == dtype
+    np.testing.assert_array_equal(back, pixels)
+
+
+def test_image_buffer_is_used_without_a_copy():
+    message = messages.image_message(HEADER, np.zeros((4, 6), np.uint16))
+    messages.image_array(message)[1, 2] = 0x0201
+    at = 2 * (6 + 2)
+    expected = [1, 2] if sys.byteorder == "little" else [2, 1]
+    assert list(message.data[at : at + 2]) == expected
+
+
+def test_part_of_an_image_becomes_a_whole_one():
+    pixels = np.arange(100, dtype=np.uint8).reshape(10, 10)
+    back = messages.image_array(messages.image_message(HEADER, pixels[2:5, 3:9]))
+    np.testing.assert_array_equal(back, pixels[2:5, 3:9])
+
+
+def test_color_image_is_bgr():
+    pixels = np.zeros((2, 3, 3), np.uint8)
+    pixels[..., 0] = 200
+    message = messages.image_message(HEADER, pixels)
+    assert (message.encoding, message.step, message.data[0]) == ("bgr8", 9, 200)
+
+
+def test_compressed_image_keeps_16_bits():
+    pixels = np.arange(400, dtype=np.uint16).reshape(20, 20) * 150
+    message = CompressedImage(header=HEADER, format="png", data=encode_png(pixels))
+    np.testing.assert_array_equal(messages.image_array(message), pixels)
+
+
+def test_an_image_that_is_too_short_is_an_encoding_error():
+    message = messages.image_message(HEADER, np.zeros((4, 6), np.uint16))
+    message.height = 5
+    with pytest.raises(EncodingError, match="too short"):
+        messages.image_array(message)
+
+
+def test_cloud_has_the_fields_of_the_design():
+    cloud = messages.detections_cloud(HEADER, detections(2))
+    doubles = "u v u_rate v_rate rel_u_rate rel_v_rate sigma_u sigma_v snr flux length angle"
+    expected = dict.fromkeys(doubles.split() + ["ra", "dec"], PointField.FLOAT64)
+    expected |= dict.fromkeys("xyz", PointField.FLOAT32)
+    expected |= {"id": PointField.UINT32, "status": PointField.UINT8}
+    assert {f.name: f.datatype for f in cloud.fields} == expected
+    assert {f.count for f in cloud.fields} == {1}
+    assert (cloud.height, cloud.width) == (1, 2)
+    assert cloud.row_step == 2 * cloud.point_step == len(cloud.data)
+    assert not cloud.is_dense  # the lines of sight are unknown
+
+
+def test_cloud_holds_the_detections():
+    rows = detections(4)
+    cloud = messages.detections_cloud(HEADER, rows)
+    assert cloud.header == HEADER
+    back = messages.cloud_array(deserialize_message(serialize_message(cloud), PointCloud2))
+    for field, column in [("u", "x"), ("v", "y"), ("u_rate", "vx"), ("v_rate", "vy")]:
+        np.testing.assert_array_equal(back[field], rows[column])
+    for field, column in [("rel_u_rate", "rel_vx"), ("sigma_v", "sigma_y"), ("id", "track_id")]:
+        np.testing.assert_array_equal(back[field], rows[column])
+    for name in ("snr", "flux", "length", "angle", "status"):
+        np.testing.assert_array_equal(back[name], rows[name])
+    for name in ("x", "y", "z"):
+        assert np.isnan(back[name]).all()
+
+
+def test_detections_come_back_from_a_cloud():
+    rows = detections(4)
+    back = messages.detections_array(messages.detections_cloud(HEADER, rows))
+    for name in set(DETECTION_DTYPE.names) - {"significance", "object_index", "flow_index"}:
+        np.testing.assert_array_equal(back[name], rows[name])
+
+
+def test_empty_cloud_is_whole():
+    cloud = messages.detections_cloud(HEADER, detections(0))
+    assert (cloud.width, len(cloud.data), len(cloud.fields)) == (0, 0, len(messages.CLOUD_DTYPE))
+    assert len(messages.cloud_array(cloud)) == 0
+
+
+def test_stars_are_the_valid_vectors_that_are_no_detection():
+    vectors = flow(6)
+    vectors.valid[1] = False
+    rows = detections(2)
+    rows["flow_index"] = [4, -1]
+    array = messages.flow_markers(HEADER, result(rows, vectors), scale=3.0)
+    (stars,) = [m for m in array.markers if m.ns == "star_flow"]
+    assert stars.type == Marker.LINE_LIST
+    assert stars.color.b > stars.color.r
+    ends = np.reshape([(p.x, p.y) for p in stars.points], (-1, 2, 2))
+    kept = [0, 2, 3, 5]
+    np.testing.assert_allclose(ends[:, 0], vectors.position[kept])
+    np.testing.assert_allclose(ends[:, 1] - ends[:, 0], 3 * vectors.displacement[kept])
+
+
+def test_rso_markers_have_a_box_and_an_id_each():
+    rows = detections(3)
+    array = messages.flow_markers(HEADER, result(rows), scale=1.0)
+    assert array.markers[0].action == Marker.DELETEALL
+    (flow_marker,) = [m for m in array.markers if m.ns == "rso_flow"]
+    assert flow_marker.color.r > flow_marker.color.b
+    assert len(flow_marker.points) == 6
+    boxes = [m for m in array.markers if m.ns == "rso_boxes"]
+    texts = [m for m in array.markers if m.ns == "rso_ids"]
+    assert len({(m.ns, m.id) for m in array.markers[1:]}) == len(array.markers) - 1
+    for row, box, text in zip(rows, boxes, texts, strict=True):
+        x, y = np.array([(p.x, p.y) for p in box.points]).T
+        assert (x.min() + x.max()) / 2 == pytest.approx(row["x"])
+        assert (y.min() + y.max()) / 2 == pytest.approx(row["y"])
+        assert x.max() - x.min() > row["length"]
+        assert text.pose.position.x == pytest.approx(row["x"])
+        assert text.text.startswith(str(row["track_id"] or "?"))
+        assert box.pose.orientation.w == text.pose.orientation.w == 1.0
+
+
+def test_unknown_length_still_gives_a_box():
+    rows = detections(1)
+    rows["length"] = np.nan
+    array = messages.flow_markers(HEADER, result(rows), scale=1.0)
+    (box,) = [m for m in array.markers if m.ns == "rso_boxes"]
+    assert np.isfinite([(p.x, p.y) for p in box.points]).all()
+
+
+def test_a_frame_without_anything_only_clears():
+    array = messages.flow_markers(HEADER, result(detections(0)), scale=1.0)
+    assert [m.action for m in array.markers] == [Marker.DELETEALL]
+
+
+def test_star_field_motion_is_unknown_without_a_field():
+    for nothing in (None, result(detections(0))):
+        vector = messages.star_field_vector(HEADER, nothing).vector
+        assert np.isnan([vector.x, vector.y, vector.z]).all()
+
+
+def test_diagnostic_is_a_warning_only_with_problems():
+    good = messages.diagnostic("name", [], "2 RSOs", {"rate_hz": 1.23456789, "stars": 12})
+    assert (good.level, good.message) == (DiagnosticStatus.OK, "2 RSOs")
+    assert [(v.key, v.value) for v in good.values] == [("rate_hz", "1.235"), ("stars", "12")]
+    bad = messages.diagnostic("name", ["no image", "slow"], "2 RSOs", {})
+    assert (bad.level, bad.message) == (DiagnosticStatus.WARN, "no image; slow")

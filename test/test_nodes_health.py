@@ -1,0 +1,113 @@
+"""What the detector says of its own state."""
+
+import pytest
+
+from ofsat_ros.nodes.health import Health
+from ofsat_ros.pipeline import FrameResult
+
+PROFILE = "/share/profile.xml"
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Return the time, s, as a list of one number to be changed."""
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    return now
+
+
+def health(reliable: bool = False) -> Health:
+    return Health("/camera/image", reliable, PROFILE)
+
+
+def problems(one: Health, publishers: int = 1) -> list[str]:
+    return one.problems(publishers, timeout_s=5.0)
+
+
+def test_nothing_is_wrong_at_the_start(clock):
+    assert problems(health()) == []
+    assert health().summary() == "waiting for images"
+
+
+def test_silence_names_the_topic_and_what_to_do(clock):
+    one = health()
+    clock[0] += 6
+    (nobody,) = problems(one, publishers=0)
+    assert "no image on /camera/image for 6 s: nobody publishes it; remap" in nobody
+    (somebody,) = problems(one, publishers=1)
+    assert f"FASTRTPS_DEFAULT_PROFILES_FILE={PROFILE}" in somebody
+    one.image_received(1, has_stamp=True)
+    assert problems(one) == []
+
+
+def test_lost_frames_are_counted_from_the_senders_numbers(clock):
+    one = health()
+    for sequence in (1, 2, 5, 6, 8):
+        one.image_received(sequence, has_stamp=True)
+    assert one.values()["frames_lost"] == 3
+    (said,) = problems(one)
+    assert "3 frames lost on the way" in said
+    assert PROFILE in said
+    clock[0] += 11
+    one.image_received(9, has_stamp=True)
+    assert problems(one) == []
+    assert one.values()["frames_lost"] == 3
+
+
+def test_a_sender_that_begins_anew_or_several_lose_nothing(clock):
+    one = health()
+    for sequence in (7, 8, 1, 2, None, 40, None, 3):
+        one.image_received(sequence, has_stamp=True)
+    assert one.values()["frames_lost"] == 0
+    assert one.values()["frames_received"] == 8
+
+
+def test_reliable_losses_have_another_remedy(clock):
+    one = health(reliable=True)
+    one.image_received(1, has_stamp=True)
+    one.image_received(3, has_stamp=True)
+    (said,) = problems(one)
+    assert "queue_depth" in said
+
+
+def test_a_failure_is_said_until_a_frame_succeeds(clock):
+    one = health()
+    one.image_received(1, has_stamp=True)
+    one.failed("the image is too short")
+    assert "the image is too short" in problems(one)[0]
+    one.processed(FrameResult(0, 0, (10, 10), reason="no object"), latency_s=0.1)
+    assert problems(one) == []
+    assert one.summary() == "no object"
+    assert one.values()["frames_failed"] == one.values()["frames_processed"] == 1
+
+
+def test_rate_is_of_the_last_seconds(clock):
+    one = health()
+    for _ in range(41):
+        clock[0] += 0.25
+        one.processed(FrameResult(0, 0, (10, 10)), latency_s=0.1)
+    assert one.values()["rate_hz"] == pytest.approx(4.0)
+    clock[0] += 20
+    assert one.values()["rate_hz"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("policy", "remedy"),
+    [
+        ("RELIABILITY", "reliable_input:=false"),
+        ("DURABILITY", "qos_overrides./camera/image.subscription.durability"),
+    ],
+)
+def test_incompatible_qos_names_the_remedy(clock, policy, remedy):
+    one = health()
+    assert remedy in one.incompatible_qos(policy)
+    assert remedy in problems(one)[0]
+    one.image_received(1, has_stamp=True)  # from another publisher
+    assert problems(one) == []
+
+
+def test_disabled_is_no_silence(clock):
+    one = health()
+    one.enabled = False
+    clock[0] += 60
+    assert problems(one) == ["disabled by ~/enable: images are ignored"]

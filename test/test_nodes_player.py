@@ -1,0 +1,185 @@
+"""The player over real DDS: what the bag holds arrives whole, in order, when it should."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import Parameter, ParameterValue
+from rcl_interfaces.srv import SetParametersAtomically
+from ros_graph import Graph, Process, sky, stamps, write_bag
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2
+
+from ofsat_ros.nodes import messages
+from ofsat_ros.nodes.player import Player
+from ofsat_ros.recordings import BagWriter
+
+FRAMES = sky(12)  # one every 0.5 s
+TIMES = [frame.stamp_ns for frame in FRAMES]
+
+
+@pytest.fixture
+def bag(tmp_path):
+    return write_bag(tmp_path / "bag", FRAMES)
+
+
+@pytest.fixture
+def stop():
+    return threading.Event()
+
+
+def test_waits_for_a_subscriber_and_loses_nothing(bag, tmp_path):
+    with Process(tmp_path, "player", f"{bag}", "--ros-args", "-p", "rate:=0") as player:
+        player.wait_for("waiting for 1 subscriber(s) to /camera/image")
+        with Graph() as graph:
+            heard = graph.listen(Image, "/camera/image")
+            graph.until(lambda: len(heard) == len(FRAMES))
+            graph.serve(0.2)
+        assert player.wait() == 0
+        assert "played 12 frames" in player.err
+    assert stamps(heard) == TIMES
+    assert {message.header.frame_id for message in heard} == {"camera_optical_frame"}
+    np.testing.assert_array_equal(messages.image_array(heard[7]), FRAMES[7].image)
+
+
+def test_a_best_effort_subscriber_gets_first_and_last_frame(bag, stop):
+    with Graph("-p", "rate:=20.0") as graph:
+        graph.add(Player(stop, f"{bag}", context=graph.context))
+        heard = graph.listen(Image, "/camera/image", best_effort=True)
+        graph.until(stop.is_set)
+        graph.serve(0.2)
+    assert (stamps(heard)[0], stamps(heard)[-1]) == (TIMES[0], TIMES[-1])
+
+
+def test_rate_start_and_clock(bag, stop):
+    arguments = ("-p", "rate:=5.0", "-p", "start_s:=2.0", "-p", f"bag:={bag}")
+    with Graph(*arguments) as graph:
+        clocks = graph.listen(Clock, "/clock")
+        heard = graph.listen(Image, "/camera/image")
+        graph.add(Player(stop, context=graph.context))
+        graph.until(lambda: heard)
+        begun_s = time.monotonic()
+        graph.until(stop.is_set)
+        graph.until(lambda: len(heard) == 8)
+        took_s = time.monotonic() - begun_s
+    assert stamps(heard) == TIMES[4:]
+    # Seven intervals of 0.5 s at five times the speed; never faster, not much slower.
+    assert 0.65 < took_s < 1.5
+    times = [messages.stamp_ns(clock.clock) for clock in clocks]
+    assert times == sorted(times)
+    assert set(TIMES[5:]) <= set(times)
+    assert len(times) > 2 * len(heard)  # it runs on between the frames
+
+
+def test_rate_may_change_while_playing(bag, stop):
+    with Graph("-p", "rate:=0.01") as graph:
+        heard = graph.listen(Image, "/camera/image")
+        graph.add(Player(stop, f"{bag}", context=graph.context))
+        graph.until(lambda: heard)
+        faster = Parameter(name="rate", value=ParameterValue(type=2, integer_value=100))
+        request = SetParametersAtomically.Request(parameters=[faster])
+        service = "player/set_parameters_atomically"
+        assert graph.call(SetParametersAtomically, service, request).result.successful
+        graph.until(stop.is_set)
+        graph.until(lambda: len(heard) == len(FRAMES))
+
+
+def test_loop_goes_on_until_told_otherwise(bag, stop):
+    with Graph("-p", "rate:=0", "-p", "loop:=true") as graph:
+        heard = graph.listen(Image, "/camera/image")
+        graph.add(Player(stop, f"{bag}", context=graph.context))
+        graph.until(lambda: len(heard) > 2 * len(FRAMES))
+        once = Parameter(name="loop", value=ParameterValue(type=1, bool_value=False))
+        request = SetParametersAtomically.Request(parameters=[once])
+        graph.call(SetParametersAtomically, "player/set_parameters_atomically", request)
+        graph.until(stop.is_set)
+        graph.serve(0.2)
+    assert len(heard) % len(FRAMES) == 0
+    assert stamps(heard) == TIMES * (len(heard) // len(FRAMES))
+
+
+def test_topic_is_chosen_and_compressed_images_go_out_as_they_are(tmp_path, stop):
+    with BagWriter(tmp_path / "two") as writer:
+        for frame in FRAMES[:4]:
+            writer.write_image("/left", frame.image, frame.stamp_ns, "left")
+            writer.write_image(
+                "/right/compressed", frame.image, frame.stamp_ns, "right", compressed=True
+            )
+    with Graph("-p", "rate:=0", "-p", "topic:=/right/compressed") as graph:
+        left = graph.listen(Image, "/left")
+        right = graph.listen(CompressedImage, "/right/compressed")
+        graph.add(Player(stop, f"{tmp_path / 'two'}", context=graph.context))
+        graph.until(lambda: len(right) == 4)
+        graph.until(stop.is_set)
+    assert left == []
+    np.testing.assert_array_equal(messages.image_array(right[3]), FRAMES[3].image)
+
+
+def test_replay_waits_for_the_answers_of_a_detector(bag, stop):
+    with Graph("-p", "rate:=0") as graph:
+        answers = graph.publisher(PointCloud2, "rso_detections")
+        heard = graph.listen(Image, "/camera/image")
+        graph.add(Player(stop, f"{bag}", context=graph.context))
+        graph.connect(answers)
+        graph.until(lambda: len(heard) == 4)
+        graph.serve(0.3)
+        assert len(heard) == 4  # no more are on their way
+        for answered in range(1, len(FRAMES) + 1):
+            assert not stop.is_set()
+            to = heard[answered - 1].header
+            answers.publish(messages.cloud_message(to, messages.cloud_rows(0)))
+            wanted = min(answered + 4, len(FRAMES))
+            graph.until(lambda wanted=wanted: len(heard) == wanted)
+        graph.until(stop.is_set)
+    assert stamps(heard) == TIMES
+
+
+def test_starting_beyond_the_end_is_an_error(bag, tmp_path):
+    arguments = (f"{bag}", "--ros-args", "-p", "start_s:=100", "-p", "wait_for_subscribers:=0")
+    with Process(tmp_path, "player", *arguments) as player:
+        assert player.wait() == 1
+        assert "holds no image after start_s = 100 s" in player.err
+
+
+def test_large_images_reach_another_process_none_lost(tmp_path):
+    # 4096 x 4096 px of 16 bit, more frames than the detector's subscription holds.  What is
+    # tested is the transport: nothing is above the threshold, which is quickly found out.
+    count, start_ns = 12, 1_767_225_600_000_000_000
+    random = np.random.default_rng(1)
+    pixels = random.normal(1000, 10, (4096, 4096)).astype(np.uint16)
+    with BagWriter(tmp_path / "large") as writer:
+        for number in range(count):
+            writer.write_image("/image", pixels, start_ns + number * 10**9, f"frame{number}")
+    settings = {
+        "reliable_input": "true",
+        "queue_depth": "3",
+        "preset": "paper_opencv",
+        "flow_targets": "objects",
+        "threshold_sigmas": "100.0",
+    }
+    given = [f"{name}:={value}" for name, value in settings.items()]
+    detector_arguments = [word for one in given for word in ("-p", one)]
+    # Without the tests' own setting: the nodes are to find the profile for large images.
+    unset = {"FASTRTPS_DEFAULT_PROFILES_FILE": ""}
+    with (
+        Graph() as graph,
+        Process(tmp_path, "detector", "--ros-args", *detector_arguments, **unset) as detector,
+    ):
+        clouds = graph.listen(PointCloud2, "rso_detections")
+        status = graph.listen(DiagnosticArray, "/diagnostics")
+        graph.until(lambda: status)
+        arguments = (f"{tmp_path / 'large'}", "--ros-args", "-p", "rate:=0")
+        with Process(tmp_path, "player", *arguments, **unset) as player:
+            graph.until(lambda: len(clouds) == count, patience_s=60)
+            assert player.wait() == 0
+        graph.until(lambda: _value(status[-1], "frames_processed") == str(count))
+        assert detector.popen.poll() is None
+    assert stamps(clouds) == [start_ns + number * 10**9 for number in range(count)]
+    assert [c.header.frame_id for c in clouds] == [f"frame{number}" for number in range(count)]
+    assert _value(status[-1], "frames_lost") == "0"
+
+
+def _value(array: DiagnosticArray, key: str) -> str:
+    return {pair.key: pair.value for pair in array.status[0].values}[key]

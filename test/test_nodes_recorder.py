@@ -1,0 +1,212 @@
+"""The recorder and the demo: the files say what was published."""
+
+import csv
+import re
+import signal
+import threading
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from geometry_msgs.msg import Vector3Stamped
+from rclpy.serialization import deserialize_message
+from ros_graph import Graph, Process, header, sky, write_bag
+from sensor_msgs.msg import Image, PointCloud2
+from visualization_msgs.msg import MarkerArray
+
+from ofsat_ros.detection import CONFIRMED
+from ofsat_ros.nodes import messages
+from ofsat_ros.nodes.recorder import HEARING, Recorder
+from ofsat_ros.nodes.runtime import StartError
+from ofsat_ros.recordings import Bag
+
+FRAMES = sky(6)
+FOUND = [0, 2, 0, 0, 1, 0]  # detections per frame
+
+
+def results(number: int) -> dict[str, object]:
+    """Return what a detector publishes for a frame, with made-up detections."""
+    head = header(FRAMES[number])
+    random = np.random.default_rng(number)
+    rows = messages.cloud_rows(FOUND[number])
+    for name in ("u", "v", "u_rate", "v_rate", "rel_u_rate", "rel_v_rate", "snr", "angle"):
+        rows[name] = random.uniform(-1.5, 1.5, len(rows))
+    rows["id"], rows["status"] = 7, CONFIRMED
+    picture = np.full((20, 30, 3), (10 * number, 0, 250), np.uint8)
+    return {
+        "rso_detections": messages.cloud_message(head, rows),
+        "star_field_motion": messages.star_field_vector(head, None),
+        "flow_markers": messages.no_flow_markers(head),
+        "image_annotated": messages.image_message(head, picture),
+    }
+
+
+def rows_of(folder: Path) -> list[dict[str, str]]:
+    with (folder / "detections.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> tuple[Path, list[dict[str, object]]]:
+    """Folder of a recorder that heard six frames, and what was published."""
+    folder = tmp_path_factory.mktemp("recorder") / "output"
+    kinds = [PointCloud2, Vector3Stamped, MarkerArray, Image]
+    published = [results(number) for number in range(len(FRAMES))]
+    stop = threading.Event()
+    arguments = ("-p", f"output:={folder}", "-p", "picture_every:=4", "-p", "frames:=6")
+    with Graph(*arguments) as graph:
+        graph.add(Recorder(stop, context=graph.context))
+        publishers = {
+            topic: graph.publisher(kind, topic)
+            for topic, kind in zip(published[0], kinds, strict=True)
+        }
+        graph.connect(*publishers.values())
+        for frame in published:
+            for topic, message in frame.items():
+                publishers[topic].publish(message)
+                graph.serve_once()
+        graph.until(stop.is_set)
+    return folder, published
+
+
+def test_detections_csv_holds_the_clouds(recorded):
+    folder, published = recorded
+    expected = [
+        (FRAMES[number].stamp_ns, number, row)
+        for number, frame in enumerate(published)
+        for row in messages.cloud_array(frame["rso_detections"])
+    ]
+    found = rows_of(folder)
+    assert len(found) == len(expected) == 3
+    for line, (stamp_ns, frame, row) in zip(found, expected, strict=True):
+        assert (int(line["stamp_ns"]), int(line["frame"])) == (stamp_ns, frame)
+        assert (line["track_id"], line["confirmed"]) == ("7", "1")
+        columns = {"x_px": "u", "vy_px_s": "v_rate", "rel_vx_px_s": "rel_u_rate", "snr": "snr"}
+        for column, field in columns.items():
+            assert float(line[column]) == pytest.approx(row[field], abs=1e-3)
+        assert float(line["angle_deg"]) == pytest.approx(np.degrees(row["angle"]), abs=1e-3)
+        assert line["ra_deg"] in ("", "nan")
+
+
+def test_detections_csv_has_the_columns_of_the_design(recorded):
+    names = (
+        "stamp_ns,frame,track_id,confirmed,x_px,y_px,vx_px_s,vy_px_s,rel_vx_px_s,rel_vy_px_s,"
+        "sigma_x_px,sigma_y_px,snr,flux,length_px,angle_deg,ra_deg,dec_deg"
+    )
+    assert (recorded[0] / "detections.csv").read_text().splitlines()[0] == names
+
+
+def test_results_bag_holds_what_was_published(recorded):
+    folder, published = recorded
+    topics = ["/rso_detections", "/star_field_motion", "/flow_markers"]
+    with Bag(folder / "results") as bag:
+        assert {name: about.count for name, about in bag.topics.items()} == dict.fromkeys(
+            topics, 6
+        )
+        heard = list(bag.messages(topics))
+    for topic in topics:
+        times = [time_ns for name, _, time_ns, _ in heard if name == topic]
+        assert times == [f.stamp_ns for f in FRAMES]
+        sent = [frame[topic.strip("/")] for frame in published]
+        kept = [
+            deserialize_message(bytes(d), type(sent[0]))
+            for name, _, _, d in heard
+            if name == topic
+        ]
+        # By their text: NaN is not equal to itself.
+        assert list(map(str, kept)) == list(map(str, sent))
+
+
+def test_every_nth_picture_is_kept(recorded):
+    folder, _ = recorded
+    assert sorted(p.name for p in folder.glob("*.png")) == ["frame_000000.png", "frame_000004.png"]
+    picture = cv2.imread(f"{folder / 'frame_000004.png'}")
+    assert picture.shape == (20, 30, 3)
+    assert (picture == (40, 0, 250)).all()
+
+
+def test_a_folder_of_results_is_used_again_but_no_other(recorded, tmp_path):
+    folder, _ = recorded
+    with Graph("-p", f"output:={folder}") as graph:
+        graph.add(Recorder(threading.Event(), context=graph.context))
+        assert rows_of(folder) == []
+        assert not list(folder.glob("*.png"))
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with (
+        Graph("-p", f"output:={tmp_path}") as graph,
+        pytest.raises(StartError, match=r"thesis\.tex, which is not a recorder's"),
+    ):
+        Recorder(threading.Event(), context=graph.context)
+    assert (tmp_path / "thesis.tex").read_text() == "years of work"
+
+
+def test_table_and_files_are_whole_after_a_signal(tmp_path):
+    folder = tmp_path / "output"
+    with (
+        Process(tmp_path, "recorder", "--ros-args", "-p", f"output:={folder}") as recorder,
+        Graph() as graph,
+    ):
+        clouds = graph.publisher(PointCloud2, "rso_detections")
+        graph.connect(clouds)
+        for number in range(5):
+            clouds.publish(results(number)["rso_detections"])
+        recorder.wait_for("frames 2 to 3: no RSO")
+        recorder.popen.send_signal(signal.SIGINT)
+        assert recorder.wait() == 0
+    lines = [line for line in recorder.out.splitlines() if line != HEARING]
+    first = next(i for i, line in enumerate(lines) if "time (UTC)" in line)
+    assert "frame 0: no RSO" in lines[first + 1]
+    assert [line.split()[2] for line in lines[first + 2 : first + 4]] == ["1", "1"]
+    when = time.gmtime(FRAMES[1].stamp_ns // 10**9)
+    assert lines[first + 2].startswith(time.strftime("%Y-%m-%d %H:%M:%S", when))
+    assert "5 frames, 3 RSO detections" in lines[-1]
+    assert len(rows_of(folder)) == 3
+    with Bag(folder / "results") as bag:
+        assert bag.topics["/rso_detections"].count == 5
+
+
+def test_demo_from_start_to_end(tmp_path):
+    frames = sky(12)
+    bag, output = write_bag(tmp_path / "bag", frames), tmp_path / "demo_output"
+    given = ("--bag", f"{bag}", "--output", f"{output}", "--rate", "0")
+    with Process(tmp_path, "demo", *given) as demo:
+        assert demo.wait(60) == 0, demo.err
+    said = re.search(r"12 frames played, 12 answered, (\d+) RSO detections", demo.out)
+    found = rows_of(output)
+    assert len(found) == int(said[1]) >= 5
+    assert {int(row["stamp_ns"]) for row in found} <= {f.stamp_ns for f in frames}
+    near = 0
+    for row in found:
+        frame = frames[int(row["frame"])]
+        assert int(row["stamp_ns"]) == frame.stamp_ns
+        if len(frame.truth):
+            distance = np.hypot(
+                float(row["x_px"]) - frame.truth["x_px"][0],
+                float(row["y_px"]) - frame.truth["y_px"][0],
+            )
+            near += distance < 2
+    assert near >= 5  # most of what is said is the one that is there
+    assert (output / "frame_000010.png").exists()
+    with Bag(output / "results") as results_bag:
+        assert results_bag.topics["/flow_markers"].count == 12
+
+
+def test_demo_leaves_no_process_behind(tmp_path):
+    bag = write_bag(tmp_path / "bag", sky(12))
+    given = ("--bag", f"{bag}", "--output", f"{tmp_path / 'output'}", "--rate", "0.1")
+    with Process(tmp_path, "demo", *given) as demo:
+        demo.wait_for("time (UTC)")
+        children = Path(f"/proc/{demo.popen.pid}/task/{demo.popen.pid}/children").read_text()
+        assert len(children.split()) == 3
+        demo.popen.send_signal(signal.SIGINT)
+        assert demo.wait() == 130
+    assert not [pid for pid in children.split() if Path(f"/proc/{pid}").exists()]
+    assert "Traceback" not in demo.err
+
+
+def test_demo_without_a_bag_says_so(tmp_path):
+    with Process(tmp_path, "demo", "--bag", f"{tmp_path / 'nothing'}") as demo:
+        assert demo.wait() == 2
+    assert "nothing does not exist" in demo.err

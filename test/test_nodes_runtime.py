@@ -1,0 +1,139 @@
+"""How nodes start and end: signals, start errors, and the hand-over to their own threads."""
+
+import os
+import re
+import signal
+import threading
+import time
+from contextlib import ExitStack
+
+import pytest
+from ros_graph import Process, sky, write_bag
+
+from ofsat_ros.nodes.runtime import Inbox
+
+MEGABYTE = 1 << 20
+
+
+def test_inbox_keeps_the_order():
+    inbox = Inbox(depth=3, newest_only=False)
+    for number in range(3):
+        assert inbox.put(number, MEGABYTE) == 0
+    assert [inbox.get() for _ in range(3)] == [0, 1, 2]
+
+
+def test_live_inbox_keeps_the_newest_and_counts_the_others():
+    inbox = Inbox(depth=3, newest_only=True)
+    assert [inbox.put(number, MEGABYTE) for number in range(3)] == [0, 1, 1]
+    assert inbox.get() == 2
+
+
+def test_full_inbox_blocks_until_there_is_room():
+    inbox = Inbox(depth=2, newest_only=False)
+    half = Inbox.LIMIT_BYTES // 2
+    inbox.put(0, half)
+    inbox.put(1, half)
+    thread = threading.Thread(target=inbox.put, args=(2, half))
+    thread.start()
+    thread.join(0.1)
+    assert thread.is_alive()
+    assert inbox.get() == 0
+    thread.join(5)
+    assert not thread.is_alive()
+    assert [inbox.get(), inbox.get()] == [1, 2]
+
+
+def test_small_frames_may_queue_beyond_the_depth():
+    inbox = Inbox(depth=2, newest_only=False)
+    for number in range(100):  # would block, and never end, if the depth were the limit
+        inbox.put(number, MEGABYTE)
+    assert inbox.get() == 0
+
+
+def test_closing_releases_both_ends():
+    inbox = Inbox(depth=1, newest_only=False)
+    got: list = []
+    thread = threading.Thread(target=lambda: got.append(inbox.get()))
+    thread.start()
+    inbox.close()
+    thread.join(5)
+    assert got == [None]
+    inbox.put(0, 2 * Inbox.LIMIT_BYTES)
+    inbox.put(1, 2 * Inbox.LIMIT_BYTES)  # does not block
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_every_node_within_a_second(number, tmp_path):
+    bag = write_bag(tmp_path / "bag", sky(2), topic="/nobody")
+    arguments = {
+        "detector": (),  # it works on the simulator's images when the signal comes
+        "simulator": ("--ros-args", "-p", "rate:=20.0"),
+        "player": (f"{bag}",),
+        "recorder": ("--ros-args", "-p", f"output:={tmp_path / 'output'}"),
+    }
+    with ExitStack() as stack:
+        nodes = {
+            name: stack.enter_context(Process(tmp_path, name, *given))
+            for name, given in arguments.items()
+        }
+        nodes["detector"].wait_for("waiting for images")
+        nodes["simulator"].wait_for("px every")
+        nodes["player"].wait_for("waiting for 1 subscriber")
+        nodes["recorder"].wait_for("hearing a detector")
+        nodes["recorder"].wait_for("no RSO")
+        segments = set(os.listdir("/dev/shm"))
+        for name, node in nodes.items():
+            sent_s = time.monotonic()
+            node.popen.send_signal(number)
+            node.popen.send_signal(number)  # an impatient user
+            assert node.wait() == 0, f"{name}: {node.err}"
+            # One second, and half of one for a machine that does something else as well.
+            assert time.monotonic() - sent_s < 1.5, name
+            assert "Traceback" not in node.err
+    assert segments - set(os.listdir("/dev/shm")), "no shared memory was given back"
+
+
+PROBLEMS = {
+    "bad value": ("detector", ["-p", "smoothing_sigma_px:=50"], "0 to 10 px, not 50"),
+    "bad type": ("detector", ["-p", "engine:=3"], "engine must be text .sparse | dense."),
+    "misspelt": ("detector", ["-p", "threshold_sigma:=3"], "did you mean threshold_sigmas"),
+    "no preset": ("detector", ["-p", "preset:=best"], "no preset 'best'; there are robust"),
+    "misspelt qos": (
+        "detector",
+        ["-p", "qos_overrides./imag.subscription.depth:=3"],
+        "did you mean qos_overrides./image.subscription.depth",
+    ),
+    "bad qos": (
+        "detector",
+        ["-p", "qos_overrides./image.subscription.reliability:=sure"],
+        "reliability.*sure",
+    ),
+    "no such file": ("detector", ["--params-file", "nowhere.yaml"], "nowhere.yaml"),
+    "no bag given": ("player", [], "no bag given: player PATH"),
+    "wrong bag": ("player", ["-p", "bag:=nowhere/bag"], "nowhere/bag does not exist"),
+    "no scenario": ("simulator", ["-p", "scenario:=rain"], "no scenario 'rain'; there are geo"),
+    "not ours": ("recorder", ["-p", "output:=."], "is not a recorder's"),
+}
+
+
+def test_a_wrong_start_is_one_clear_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with ExitStack() as stack:
+        started = {}
+        for name, (node, arguments, _) in PROBLEMS.items():
+            (tmp_path / name).mkdir()
+            process = Process(tmp_path / name, node, "--ros-args", *arguments)
+            started[name] = stack.enter_context(process)
+        for name, process in started.items():
+            node, _, said = PROBLEMS[name]
+            assert process.wait(60) == 2, f"{name}: {process.err}"
+            lines = [line for line in process.err.splitlines() if line.startswith(f"{node}: ")]
+            assert len(lines) == 1, f"{name}: {process.err}"
+            assert re.search(said, lines[0]), f"{name}: {lines[0]}"
+            assert "Traceback" not in process.err
+
+
+def test_parameters_of_another_node_are_only_warned_of(tmp_path):
+    with Process(tmp_path, "detector", "--ros-args", "-p", "bag:=night.mcap") as detector:
+        detector.wait_for("parameter bag is read by player")
+        detector.wait_for("waiting for images")
