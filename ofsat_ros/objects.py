@@ -18,7 +18,7 @@ OBJECT_DTYPE = np.dtype(
         ("sigma_y", "f8"),
         ("flux", "f8"),  # DN, sum over the region, background subtracted
         ("snr", "f8"),  # matched filter
-        ("peak", "f8"),  # highest smoothed value, DN
+        ("peak", "f8"),  # highest smoothed value over the background, DN
         ("length", "f8"),  # length of the streak, px; 0 for a round object
         ("angle", "f8"),  # direction of the streak, rad from x to y, within (-pi/2, pi/2]
         ("area", "i4"),  # px
@@ -36,20 +36,24 @@ def find_objects(
     noise_ratio: NDArray[np.float32],
     min_area_px: int = 1,
     max_objects: int = 5000,
+    pedestal: float = 0.0,
 ) -> tuple[NDArray[np.void], NDArray[np.int32]]:
     """Measure the connected regions of a mask.
 
-    Position and shape are the first and second moments of the smoothed brightness in the region.
+    The position is the mean of the region's pixels weighted by the square of the smoothed
+    brightness, which is what a window as wide as the star does: wings that are mostly noise count
+    little.  The shape is the second moments of the smoothed brightness.
     A uniform line of length L adds L^2/12 to the variance along it, hence
     L = sqrt(12 (major - minor)).  The SNR is the larger of two estimates of the matched filter's
     sqrt(sum s_i^2 / var_i): peak over noise in the smoothed image, right for a point source, and
     the sum over the region's pixels less what noise alone would give, right for a streak.  The
-    centroid's std is sqrt(2 moment) / SNR, the Cramer-Rao bound of a Gaussian in white noise.
+    centroid's std is sqrt(2 moment) / SNR: for a Gaussian in white noise the Cramer-Rao bound is
+    that of the moment before smoothing; these centroids reach it with the moment after.
 
     Parameters
     ----------
     image, smoothed : (H, W) float32
-        Background-subtracted image and its smoothed version, DN.
+        The image and its smoothed version, DN.
     mask : (H, W) uint8
         Nonzero inside objects.
     pixel_noise, noise : float
@@ -60,6 +64,8 @@ def find_objects(
         Smaller regions are left out.
     max_objects : int
         The regions with the largest SNR are kept.
+    pedestal : float
+        Level of the background in `image` and `smoothed`, DN; 0 if it was subtracted.
 
     Returns
     -------
@@ -68,10 +74,10 @@ def find_objects(
     labels : (H, W) int32
         1 + index of the object that a pixel belongs to, 0 for none.
     """
-    count, regions = cv2.connectedComponents(mask, connectivity=8, ltype=cv2.CV_32S)
     inside = cv2.findNonZero(mask)
     if inside is None:
         return np.zeros(0, OBJECT_DTYPE), np.zeros(mask.shape, np.int32)
+    count, regions = cv2.connectedComponents(mask, connectivity=8, ltype=cv2.CV_32S)
     x, y = inside.reshape(-1, 2).T.astype(np.intp)
     region = regions[y, x]
     height, width = mask.shape
@@ -79,15 +85,16 @@ def find_objects(
     def total(weights: NDArray[np.generic] | None = None) -> NDArray[np.float64]:
         return np.bincount(region, weights, count)[1:].astype(np.float64)
 
-    value = smoothed[y, x].astype(np.float64)
-    raw = image[y, x].astype(np.float64)
+    value = smoothed[y, x].astype(np.float64) - pedestal
+    raw = image[y, x].astype(np.float64) - pedestal
     area = total()
     # Every weight is positive, also where a published threshold lies below the background.
     lowest = np.full(count, np.inf)
     np.minimum.at(lowest, region, value)
     weight = value - np.minimum(lowest[region], 0) + 1e-6 * noise
     norm = total(weight)
-    cx, cy = total(weight * x) / norm, total(weight * y) / norm
+    square = weight**2
+    cx, cy = (total(square * place) / total(square) for place in (x, y))
     dx, dy = x - cx[region - 1], y - cy[region - 1]
     # A pixel is a square of side 1: its variance keeps a single pixel from having none.
     xx = total(weight * dx * dx) / norm + 1 / 12
@@ -106,8 +113,9 @@ def find_objects(
     objects["sigma_x"], objects["sigma_y"] = (
         np.sqrt(2 * moment) / np.maximum(snr, 1) for moment in (xx, yy)
     )
-    # A round object's moments differ by chance: by its SNR, and by the pixel grid.
-    chance = np.maximum(0.25, 6 / np.maximum(snr, 1)) * ((xx + yy) / 2 - split)
+    # A round object's moments differ by chance: by its SNR (97 % of them by less than this), and
+    # by the pixel grid.
+    chance = np.maximum(0.25, 10 / np.maximum(snr, 1)) * ((xx + yy) / 2 - split)
     objects["length"] = np.where(2 * split > chance, np.sqrt(12 * 2 * split), 0)
     angle = np.arctan2(2 * xy, xx - yy) / 2
     objects["angle"] = np.where(angle <= -np.pi / 2, np.pi / 2, angle)

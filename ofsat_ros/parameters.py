@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import resources
+from numbers import Real
 from typing import Any, ClassVar, Self
 
 import yaml
@@ -70,7 +70,7 @@ class Description:
         if isinstance(self.default, bool):
             return "true | false"
         if self.low is not None:
-            return f"{self.low:g} to {self.high:g}"
+            return f"{self.low:.10g} to {self.high:.10g}"
         return "text"
 
     def check(self, value: Any) -> Any:
@@ -83,11 +83,14 @@ class Description:
             parameter, the value and what is allowed.
         """
         kind = type(self.default)
-        numeric = isinstance(value, int | float) and not isinstance(value, bool)
-        if kind is float and numeric:
-            value = float(value)
-        elif kind is int and numeric and float(value).is_integer():
-            value = int(value)
+        numeric = isinstance(value, Real) and not isinstance(value, bool)
+        if numeric and self.low is not None and self.high is not None:
+            if not self.low <= value <= self.high:  # NaN is in no range
+                unit = f" {self.unit}" if self.unit else ""
+                raise ParameterError(
+                    f"{self.name} must be within {self.allowed}{unit}, not {value!r}"
+                )
+            value = kind(value) if kind(value) == value else value
         if type(value) is not kind:
             words = {bool: "a switch", int: "an integer", float: "a number", str: "text"}
             raise ParameterError(
@@ -95,12 +98,6 @@ class Description:
             )
         if self.choices and value not in self.choices:
             raise ParameterError(f"{self.name} must be one of {self.allowed}, not {value!r}")
-        if self.low is not None and self.high is not None:
-            if not (math.isfinite(value) and self.low <= value <= self.high):
-                unit = f" {self.unit}" if self.unit else ""
-                raise ParameterError(
-                    f"{self.name} must be within {self.allowed}{unit}, not {value!r}"
-                )
         return value
 
 

@@ -23,6 +23,8 @@ from ofsat_ros.star_field import StarFieldMotion, estimate_motion, vote_shift
 
 _SMALLEST_SIDE = 16
 _DTYPES = ("uint8", "uint16", "float32")
+# Images that were preprocessed differently cannot be compared.
+_PREPROCESSING = [p.name for p in Parameters.describe() if p.stage == "preprocessing"]
 
 
 class ImageError(ValueError):
@@ -38,7 +40,7 @@ class FrameResult:
     stamp_ns : int
         Its stamp, ns UTC.
     frame : int
-        Count of frames that the pipeline was given before it.
+        Count of frames that the pipeline processed before it.
     shape : (height, width)
         Size of the image, px.
     dt_s : float
@@ -54,8 +56,8 @@ class FrameResult:
     detections : (K,) DETECTION_DTYPE
         RSO candidates.
     background, noise, threshold : float
-        Median level of the background, std of the smoothed background, threshold over the
-        background, DN.
+        Median level of the background, std of the smoothed background, threshold of the smoothed
+        image (less its background if that was subtracted), DN.
     reason : str
         Why nothing was detected, in words; empty if something was.
     seconds : dict
@@ -84,6 +86,7 @@ class _Previous:
 
     stamp_ns: int
     dtype: np.dtype
+    parameters: Parameters
     objects: NDArray[np.void]
     flow_input: FlowInput
 
@@ -160,22 +163,26 @@ class Pipeline:
                 pre.noise_ratio,
                 parameters.min_area_px,
                 parameters.max_objects,
+                pre.pedestal,
             )
         xy, sigma = _pairs(result.objects, "x", "y"), _pairs(result.objects, "sigma_x", "sigma_y")
         length = result.objects["length"]
-        current = FlowInput(pre.smoothed, pre.mask, labels, xy, sigma, length, pre.noise)
+        # What engines find by themselves is found in I_f as published, background and all.
+        native = parameters.flow_targets == "native" or not pre.pedestal
+        smoothed = pre.smoothed if native else pre.smoothed - np.float32(pre.pedestal)
+        current = FlowInput(smoothed, pre.mask, labels, xy, sigma, length, pre.noise)
 
-        previous = self._usable_previous(image, stamp_ns, parameters.max_gap_s)
+        previous = self._usable_previous(image, stamp_ns, parameters)
         result.reset, self._reset_reason = self._reset_reason, ""
         if previous is not None:
             result.dt_s = (stamp_ns - previous.stamp_ns) / 1e9
             self._compare(previous, current, result, parameters)
-        self._previous = _Previous(stamp_ns, image.dtype, result.objects, current)
+        self._previous = _Previous(stamp_ns, image.dtype, parameters, result.objects, current)
         result.reason = _why_nothing(result)
         return result
 
     def _usable_previous(
-        self, image: NDArray[np.generic], stamp_ns: int, max_gap_s: float
+        self, image: NDArray[np.generic], stamp_ns: int, parameters: Parameters
     ) -> _Previous | None:
         """The previous frame, or None with the reason in `_reset_reason`."""
         previous = self._previous
@@ -183,6 +190,12 @@ class Pipeline:
             return None
         before, now = previous.flow_input.smoothed.shape, image.shape
         dt_s = (stamp_ns - previous.stamp_ns) / 1e9
+        max_gap_s = parameters.max_gap_s
+        changed = [
+            name
+            for name in _PREPROCESSING
+            if getattr(parameters, name) != getattr(previous.parameters, name)
+        ]
         if before != now:
             self.reset(
                 f"the image's size changed from {before[1]}x{before[0]} to {now[1]}x{now[0]}"
@@ -195,6 +208,8 @@ class Pipeline:
             self.reset(f"time ran backwards by {-dt_s:g} s")
         elif dt_s > max_gap_s:
             self.reset(f"a gap of {dt_s:g} s is longer than max_gap_s = {max_gap_s:g} s")
+        elif changed:
+            self.reset(f"{' and '.join(changed)} changed")
         return self._previous
 
     @staticmethod
@@ -283,4 +298,6 @@ def _why_nothing(result: FrameResult) -> str:
         return f"none of {len(result.objects)} objects was found in the previous frame"
     if result.star_field is None:
         return f"the {valid} flow vectors do not agree on a motion of the star field"
+    if valid == 1:
+        return "only one object was found in the previous frame: no star field to compare it with"
     return f"everything moves with the star field ({result.star_field.star_count} stars)"

@@ -18,8 +18,12 @@ from ofsat_ros.parameters import Parameters
 
 Image = NDArray[np.float32]
 
-# Samples per side of a mesh cell: 1,024 values give its median to 4 % of the noise.
+# Samples per side of a mesh cell: 1,024 values give its level to 4 % of the noise.
 _SAMPLES = 32
+# Cells per side that are enough for one number, the median of the noise.
+_NOISE_CELLS = 8
+# Beyond it the squares of float32 overflow; files mark missing pixels by such numbers.
+_LARGEST = 1e15
 # A star's neighbour holds at least this fraction of its peak (a Gaussian of FWHM 1.4 px or more,
 # anywhere on the pixel grid); a defect's neighbours hold noise.
 _DEFECT_RATIO = 0.25
@@ -33,26 +37,29 @@ class Preprocessed:
     Attributes
     ----------
     image : (H, W) float32
-        Image less its background, defects replaced, DN.
+        Image less its background if that is a mesh, defects replaced, DN.
     smoothed : (H, W) float32
         The same, smoothed (I_s), DN.
     mask : (H, W) uint8
         1 where `smoothed` is above the threshold.
     background : float
         Median level of the background, DN.
+    pedestal : float
+        What `image` and `smoothed` still hold of it, DN: 0 if it was subtracted.
     pixel_noise, noise : float
         Std of the background in `image` and in `smoothed`, DN; the median over the image.
         Never 0: at least what quantisation leaves.
     noise_ratio : (ny, nx) float32
         Noise over its median, on a mesh of equal cells; one cell when it is not local.
     threshold : float
-        Threshold over the background, DN; the median over the image.
+        Threshold of `smoothed`, DN; the median over the image.
     """
 
     image: Image
     smoothed: Image
     mask: NDArray[np.uint8]
     background: float
+    pedestal: float
     pixel_noise: float
     noise: float
     noise_ratio: Image
@@ -70,7 +77,7 @@ def preprocess(raw: NDArray[np.generic], parameters: Parameters) -> Preprocessed
     Parameters
     ----------
     raw : (H, W) uint8, uint16 or float32
-        The image, DN.  Values that are not finite count as background.
+        The image, DN.  Values that are not finite, or beyond 1e15, count as background.
     parameters : Parameters
         Those of the stage ``preprocessing``.
 
@@ -84,23 +91,25 @@ def preprocess(raw: NDArray[np.generic], parameters: Parameters) -> Preprocessed
         If no pixel is finite.
     """
     image = _finite(raw)
+    rounding = _rounding_noise(image, raw.dtype)
     cell = parameters.background_cell_px if parameters.background == "mesh" else max(raw.shape)
     # A mesh needs a frame of cells to interpolate between; a small image is one cell.
     mesh = (max(1, round(raw.shape[0] / cell)), max(1, round(raw.shape[1] / cell)))
-    level, spread = _mesh_statistics(image, mesh)
-    background = float(np.median(level))
+    level, _ = _mesh_statistics(image, mesh, rounding)
+    background = pedestal = float(np.median(level))
     if parameters.background == "mesh":
-        image -= _stretch_mesh(level, image.shape)
-    quantum = _quantisation_noise(image, raw.dtype)
-    pixel_noise = max(float(np.median(spread)), quantum)
+        image -= _background_map(level, image.shape)
+        pedestal = 0.0
+    # Of what is left: a gradient inside a cell is no noise.
+    coarse = (min(mesh[0], _NOISE_CELLS), min(mesh[1], _NOISE_CELLS))
+    pixel_noise = float(np.median(_mesh_statistics(image, coarse, rounding)[1]))
     if parameters.hot_pixels == "replace":
-        base = 0.0 if parameters.background == "mesh" else background
-        _replace_defects(image, base, pixel_noise)
+        _replace_defects(image, pedestal, pixel_noise)
 
     sigma = parameters.smoothing_sigma_px
     smoothed = cv2.GaussianBlur(image, (0, 0), sigma) if sigma > 0 else image.copy()
     # A Gaussian of sigma s lowers white noise to 1 / (2 sqrt(pi) s), if s is not tiny.
-    floor = quantum * (min(1.0, 0.5 / (math.sqrt(math.pi) * sigma)) if sigma > 0 else 1.0)
+    floor = rounding * (min(1.0, 0.5 / (math.sqrt(math.pi) * sigma)) if sigma > 0 else 1.0)
     count = parameters.threshold_sigmas
     if parameters.threshold_statistics == "all":
         mean, std = (float(v[0, 0]) for v in cv2.meanStdDev(smoothed))
@@ -108,8 +117,7 @@ def preprocess(raw: NDArray[np.generic], parameters: Parameters) -> Preprocessed
         threshold = mean + count * noise
         mask = cv2.compare(smoothed, threshold, cv2.CMP_GT)
     else:
-        mean_mesh, noise_mesh = _mesh_statistics(smoothed, mesh)
-        noise_mesh = np.maximum(noise_mesh, np.float32(floor))
+        mean_mesh, noise_mesh = _mesh_statistics(smoothed, mesh, floor)
         noise = float(np.median(noise_mesh))
         ratio = noise_mesh / np.float32(noise)
         limit = mean_mesh + count * noise_mesh
@@ -120,6 +128,7 @@ def preprocess(raw: NDArray[np.generic], parameters: Parameters) -> Preprocessed
         smoothed=smoothed,
         mask=cv2.min(mask, 1),
         background=background,
+        pedestal=pedestal,
         pixel_noise=pixel_noise,
         noise=noise,
         noise_ratio=ratio,
@@ -128,51 +137,93 @@ def preprocess(raw: NDArray[np.generic], parameters: Parameters) -> Preprocessed
 
 
 def _finite(raw: NDArray[np.generic]) -> Image:
-    """A float32 copy in which every value is finite."""
+    """A float32 copy in which every value is finite, and its square too."""
     image = raw.astype(np.float32)
     if raw.dtype.kind == "f":
-        finite = np.isfinite(image)
-        if not finite.any():
+        usable = np.abs(image) < _LARGEST
+        if not usable.any():
             raise ValueError("no pixel of the image is a finite number")
-        if not finite.all():
-            image[~finite] = np.median(image[finite])
+        if not usable.all():
+            image[~usable] = np.median(image[usable])
     return image
 
 
-def _quantisation_noise(image: Image, dtype: np.dtype) -> float:
-    """Noise that even an image without any has: of rounding to whole DN, or to 16 bits if float.
+def _rounding_noise(image: Image, dtype: np.dtype) -> float:
+    """Std of rounding to whole DN, or of a float image to 16 bits; never 0.
 
     Compressed black sky and simulated frames have a std of 0, which nothing may be divided by.
     """
     low, high, _, _ = cv2.minMaxLoc(image)
-    step = 1.0 if dtype.kind == "u" else max((high - low) / 65535, 1e-30)
+    step = 1.0 if dtype.kind == "u" else max((high - low) / 65535, 1e-15)
     return step / math.sqrt(12)
 
 
-def _mesh_statistics(image: Image, mesh: tuple[int, int]) -> tuple[Image, Image]:
-    """Clipped mean level and std of each cell, (ny, nx) each, the stars left out."""
+def _mesh_statistics(image: Image, mesh: tuple[int, int], floor: float) -> tuple[Image, Image]:
+    """Clipped mean level and std of each cell, (ny, nx) each, the stars left out.
+
+    No std is less than `floor`, the std of rounding.
+    """
     rows, columns = mesh
     samples = _SAMPLES if rows * columns > 1 else 16 * _SAMPLES
     # Nearest-neighbour resizing is an even subsample of every cell, whatever the image's size.
     size = (columns * samples, rows * samples)
     cells = cv2.resize(image, size, interpolation=cv2.INTER_NEAREST)
     cells = cells.reshape(rows, samples, columns, samples).transpose(0, 2, 1, 3)
-    values = cells.reshape(rows, columns, -1)
-    level = np.median(values, axis=2, keepdims=True)
-    spread = 1.4826 * np.median(np.abs(values - level), axis=2, keepdims=True)
+    values = cells.reshape(rows * columns, -1)
+    middle = _median(values)
+    deviation = values - middle
+    spread = 1.4826 * _median(np.abs(deviation))
+    shift = np.zeros_like(spread)
     for _ in range(2):
-        # The slack keeps neighbouring grey levels when most of a cell has one value.
-        inside = np.abs(values - level) <= 3 * spread + 0.5
-        number = inside.sum(axis=2, keepdims=True)
-        level = np.sum(values * inside, axis=2, keepdims=True) / number
+        # The slack keeps the neighbouring grey levels when most of a cell has one value.
+        inside = np.abs(deviation - shift) <= 3 * spread + np.float32(3.5 * floor)
+        kept = np.where(inside, deviation, 0)
+        number = inside.sum(axis=1, keepdims=True, dtype=np.float32)
+        shift = kept.sum(axis=1, keepdims=True) / number
+        variance = np.einsum("ij,ij->i", kept, kept)[:, None] / number - shift**2
         # 0.9866: the std that is left of a normal distribution clipped at 3 sigma
-        variance = np.sum((values - level) ** 2 * inside, axis=2, keepdims=True) / number
-        spread = np.sqrt(variance) / 0.9866
-    level, spread = level[..., 0].astype(np.float32), spread[..., 0].astype(np.float32)
+        spread = np.sqrt(np.maximum(variance, 0)) / np.float32(0.9866)
+    level = (middle + shift).reshape(mesh)
+    spread = np.maximum(spread, np.float32(floor)).reshape(mesh)
     if min(mesh) >= 3:
-        # A cell filled by a bright star takes its neighbours' values.
-        return cv2.medianBlur(level, 3), cv2.medianBlur(spread, 3)
+        # A cell filled by a bright star takes its neighbours' values; others keep their level,
+        # since medians flatten a curved background.
+        near, spread = (cv2.medianBlur(_continued(m), 3)[1:-1, 1:-1] for m in (level, spread))
+        level = np.where(np.abs(level - near) <= spread, level, near)
     return level, spread
+
+
+def _median(values: Image) -> Image:
+    """Median along the rows, (N, 1); of an even number, the upper of the middle two."""
+    middle = values.shape[1] // 2
+    return np.partition(values, middle, axis=1)[:, middle : middle + 1]
+
+
+def _continued(mesh: Image) -> Image:
+    """A mesh with one more cell on each side, (ny + 2, nx + 2).
+
+    It goes on by the last step, or twice the one before if that is less, in the same direction:
+    a gradient or vignetting goes on, the shadow of an occulter does not.
+    """
+    for _ in range(2):
+        ends = []
+        for side in (mesh, mesh[::-1]):
+            outer, inner = side[0], side[min(1, len(side) - 1)]
+            first, second = outer - inner, inner - side[min(2, len(side) - 1)]
+            least = np.minimum(np.abs(first), 2 * np.abs(second))
+            ends.append(outer + np.where(first * second > 0, np.sign(first) * least, 0))
+        mesh = np.vstack([ends[0], mesh, ends[1]]).T
+    return np.ascontiguousarray(mesh)
+
+
+def _background_map(level: Image, shape: tuple[int, ...]) -> Image:
+    """A mesh of levels interpolated to the image's size, and continued to its border."""
+    height, width = shape[0] / level.shape[0], shape[1] / level.shape[1]
+    # To whole pixels: what the background rises by in one is far under the noise.
+    larger = (round(shape[0] + 2 * height), round(shape[1] + 2 * width))
+    top, left = round(height), round(width)
+    whole = _stretch_mesh(_continued(level), larger)
+    return whole[top : top + shape[0], left : left + shape[1]]
 
 
 def _stretch_mesh(mesh: Image, shape: tuple[int, ...]) -> Image:
@@ -186,11 +237,19 @@ def _replace_defects(image: Image, base: float, noise: float) -> None:
     if bright is None:
         return
     x, y = bright.reshape(-1, 2).T
-    height, width = image.shape
+
+    def beside(dy: int, dx: int) -> Image:
+        return image[_mirrored(y + dy, image.shape[0]), _mirrored(x + dx, image.shape[1])]
+
     steps = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0)]
-    around = np.stack(
-        [image[np.clip(y + dy, 0, height - 1), np.clip(x + dx, 0, width - 1)] for dy, dx in steps]
-    )
-    peak = image[y, x] - base
-    defect = around.max(axis=0) - base < _DEFECT_RATIO * peak
-    image[y[defect], x[defect]] = np.median(around[:, defect], axis=0)
+    for step in steps:
+        # One by one, since few are left after the first.
+        alone = beside(*step) - base < _DEFECT_RATIO * (image[y, x] - base)
+        y, x = y[alone], x[alone]
+    image[y, x] = np.median([beside(*step) for step in steps], axis=0)
+
+
+def _mirrored(index: NDArray[np.integer], size: int) -> NDArray[np.integer]:
+    """Indices of which those one step outside are mirrored at the border."""
+    last = size - 1
+    return last - np.abs(last - np.abs(index))

@@ -1,0 +1,403 @@
+"""Preprocessing: thresholds as published, backgrounds, noise and defects that are known."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.stats import norm
+
+from ofsat_ros.parameters import Parameters
+from ofsat_ros.preprocessing import Preprocessed, preprocess
+
+PUBLISHED = {"background": "none", "threshold_statistics": "all", "hot_pixels": "keep"}
+# Smoothing lowers white noise to this for sigma 1 px: 1 / (2 sqrt(pi)), sampled on the grid.
+SMOOTHED = 0.2821
+
+
+def run(image: np.ndarray, **changes) -> Preprocessed:
+    return preprocess(image, Parameters.preset(**changes))
+
+
+def noise(
+    shape: tuple[int, int] = (512, 512), level: float = 1000, std: float = 20, seed: int = 1
+) -> np.ndarray:
+    return np.random.default_rng(seed).normal(level, std, shape)
+
+
+def counts(image: np.ndarray, dtype: type = np.uint16) -> np.ndarray:
+    return np.clip(np.rint(image), 0, np.iinfo(dtype).max).astype(dtype)
+
+
+def integrated_star(
+    x: float, y: float, sigma: float, flux: float = 1.0, shape: tuple[int, int] = (15, 15)
+) -> np.ndarray:
+    """A Gaussian integrated over each pixel, as a sensor does."""
+
+    def share(size: int, centre: float) -> np.ndarray:
+        edges = (np.arange(size + 1) - 0.5 - centre) / sigma
+        return np.diff(norm.cdf(edges))
+
+    return flux * np.outer(share(shape[0], y), share(shape[1], x))
+
+
+def with_stars(image: np.ndarray, count: int, flux: float, seed: int = 2) -> np.ndarray:
+    random = np.random.default_rng(seed)
+    image = image.copy()
+    for x, y in random.uniform(8, np.array(image.shape[::-1]) - 9, (count, 2)):
+        left, top = round(x) - 7, round(y) - 7
+        spot = integrated_star(x - left, y - top, 1.0, flux)
+        image[top : top + 15, left : left + 15] += spot
+    return image
+
+
+# As published (AAS 21-364)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+@pytest.mark.parametrize(("sigma", "count"), [(1.0, 3.0), (2.5, 1.0)])
+def test_the_published_threshold_is_mean_plus_n_std(dtype, sigma: float, count: float):
+    image = counts(with_stars(noise(level=100, std=5), 30, 2000), np.uint8).astype(dtype)
+    pre = run(image, smoothing_sigma_px=sigma, threshold_sigmas=count, **PUBLISHED)
+    # SciPy cuts the kernel at 4 sigma, as OpenCV does for float32, and mirrors alike.
+    smoothed = gaussian_filter(image.astype(float), sigma, mode="mirror", truncate=4)
+    np.testing.assert_allclose(pre.smoothed, smoothed, atol=0.01)
+    threshold = smoothed.mean() + count * smoothed.std()
+    assert pre.threshold == pytest.approx(threshold, abs=0.005)
+    assert pre.noise == pytest.approx(smoothed.std(), abs=0.005)
+    clear = np.abs(smoothed - threshold) > 0.02
+    assert np.array_equal(pre.mask[clear] == 1, (smoothed > threshold)[clear])
+    assert set(np.unique(pre.mask)) == {0, 1}
+    assert np.array_equal(pre.filtered, np.where(pre.mask, pre.smoothed, 0))
+
+
+def test_without_smoothing_the_image_itself_is_compared():
+    image = counts(noise())
+    pre = run(image, smoothing_sigma_px=0, threshold_sigmas=1, **PUBLISHED)
+    assert np.array_equal(pre.smoothed, image.astype(np.float32))
+    limit = image.astype(float).mean() + image.astype(float).std()
+    assert np.array_equal(pre.mask == 1, image > limit)
+
+
+def test_what_is_left_of_the_background_is_told():
+    image = counts(noise())
+    kept, subtracted = run(image, background="none"), run(image)
+    assert kept.background == pytest.approx(1000, abs=0.5)
+    assert kept.pedestal == kept.background
+    assert subtracted.background == pytest.approx(1000, abs=0.5)
+    assert subtracted.pedestal == 0
+    # The threshold is that of `smoothed`, pedestal and all.
+    expected = 4 * 20 * SMOOTHED
+    assert kept.threshold - kept.pedestal == pytest.approx(expected, rel=0.05)
+    assert subtracted.threshold == pytest.approx(expected, rel=0.05)
+
+
+# Noise and threshold
+
+
+@pytest.mark.parametrize("background", ["mesh", "none"])
+@pytest.mark.parametrize(
+    ("dtype", "level", "std"),
+    [
+        *((np.uint8, 60, 0.5), (np.uint8, 60, 3), (np.uint16, 1000, 20)),
+        *((np.uint16, 30000, 2000), (np.float32, 0.5, 0.01), (np.float32, 1e6, 3000)),
+    ],
+)
+def test_noise_is_measured(dtype, level: float, std: float, background: str):
+    image = noise(level=level, std=std)
+    image = image.astype(dtype) if dtype is np.float32 else counts(image, dtype)
+    pre = run(image, background=background)
+    # Rounding is noise, too; the estimate's own error is 0.5 % (512^2 / 4 samples, clipped).
+    truth = image.astype(float).std()
+    assert pre.pixel_noise == pytest.approx(truth, rel=0.03)
+    assert pre.noise == pytest.approx(truth * SMOOTHED, rel=0.03)
+
+
+@pytest.mark.parametrize("count", [2.0, 3.0, 4.0])
+def test_false_alarms_are_as_many_as_theory_says(count: float):
+    pre = run(noise((1024, 1024)).astype(np.float32), threshold_sigmas=count)
+    expected = norm.sf(count)
+    # Local levels and noises scatter by 3 %, which lets through some 10 % more at 4 sigma;
+    # smoothed pixels come in clumps of about 13: 33 alarms at 4 sigma are some 3 independent ones.
+    independent = expected * 1024**2 / (4 * math.pi)
+    tolerance = 0.1 + 4 / math.sqrt(independent)
+    assert pre.mask.mean() == pytest.approx(expected, rel=tolerance)
+
+
+def test_stars_do_not_raise_the_clipped_threshold():
+    sky = noise()
+    few, many = (run(counts(with_stars(sky, n, 20_000))) for n in (0, 400))
+    # 400 stars cover 7 % of the pixels; of what their wings leave inside 3 sigma, the noise
+    # keeps a few per cent.
+    assert many.pixel_noise == pytest.approx(few.pixel_noise, rel=0.03)
+    assert many.threshold == pytest.approx(few.threshold, rel=0.12)
+    published = [run(counts(with_stars(sky, n, 20_000)), **PUBLISHED).threshold for n in (0, 400)]
+    assert published[1] - 1000 > 10 * (published[0] - 1000)
+
+
+def test_one_star_that_fills_a_cell_does_not_hide_its_neighbours():
+    y, x = np.mgrid[:512, :512]
+    halo = 5000 * np.exp(-((x - 288) ** 2 + (y - 288) ** 2) / (2 * 15**2))
+    pre, without = run(counts(noise() + halo)), run(counts(noise()))
+    # The star covers 4 cells; two thirds of the halo's neighbours still see a part of it.
+    assert pre.noise_ratio.max() < 1.5
+    assert pre.pixel_noise == pytest.approx(without.pixel_noise, rel=0.03)
+
+
+def test_the_noise_map_follows_the_noise():
+    x = np.linspace(10, 40, 512)
+    random = np.random.default_rng(3)
+    image = 1000 + random.normal(0, 1, (512, 512)) * x
+    pre = run(counts(image), threshold_sigmas=3)
+    measured = pre.noise * pre.noise_ratio.mean(axis=0)
+    expected = x.reshape(-1, 64).mean(axis=1) * SMOOTHED
+    # The outer cells' medians over 3 x 3 are their own; each mean is over 8 cells of 5 %.
+    np.testing.assert_allclose(measured, expected, rtol=0.08)
+    assert pre.noise == pytest.approx(25 * SMOOTHED, rel=0.05)
+    assert pre.pixel_noise == pytest.approx(25, rel=0.05)
+    left, right = pre.mask[:, :256].mean(), pre.mask[:, 256:].mean()
+    # 177 pixels a half by theory, in clumps: a threshold that was not local would give 0 and
+    # some 1,500.
+    assert 0.4 < left / norm.sf(3) < 2
+    assert 0.4 < right / norm.sf(3) < 2
+
+
+# Background
+
+
+def gradient(slope_x: float, slope_y: float, shape: tuple[int, int]) -> np.ndarray:
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    return slope_x * x + slope_y * y
+
+
+def vignetting(shape: tuple[int, int]) -> np.ndarray:
+    """Light falling to 60 % in the corners, cos^4-like."""
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    r2 = ((x - shape[1] / 2) ** 2 + (y - shape[0] / 2) ** 2) / (shape[0] ** 2 + shape[1] ** 2) * 4
+    return 3000 * (1 - 0.4 * r2)
+
+
+@pytest.mark.parametrize("slopes", [(2, 0), (2, -2), (-1, 3)])
+@pytest.mark.parametrize("shape", [(512, 512), (500, 333), (608, 968)])
+def test_a_gradient_is_removed_up_to_the_border(shape: tuple[int, int], slopes):
+    slope = gradient(*slopes, shape)
+    sky = noise(shape, level=4000)
+    flat, pre = run(counts(sky)), run(counts(sky + slope))
+    residual = pre.image - flat.image
+    # Cells' levels are known to 4 % of the noise and the map to one pixel of the slope; in the
+    # corners, continued by 1.5 of one cell less 0.5 of another each way, to three times that.
+    one_pixel = sum(map(abs, slopes))
+    assert np.sqrt(np.mean(residual**2)) < 0.06 * 20 + one_pixel
+    assert np.abs(residual).max() < 3 * (0.06 * 20 + one_pixel)
+    assert pre.pixel_noise == pytest.approx(20, rel=0.03)
+    assert pre.noise == pytest.approx(flat.noise, rel=0.03)
+    assert pre.mask.mean() < 4 * norm.sf(4)
+    assert pre.background == pytest.approx(np.median(sky + slope), abs=32 * one_pixel)
+
+
+def test_vignetting_is_removed():
+    shape = (1024, 1024)
+    sky = noise(shape, level=0) + vignetting(shape)
+    pre = run(counts(sky))
+    residual = pre.image - noise(shape, level=0)
+    # Cells' levels have second differences of 18.7 DN each way; lines between means of a
+    # parabola are an eighth of that off, 4.7 DN for both, which the local threshold takes in.
+    assert np.sqrt(np.mean(residual**2)) < 6
+    assert np.abs(residual).max() < 20
+    assert pre.pixel_noise == pytest.approx(20, rel=0.03)
+    assert pre.mask.mean() < 3 * norm.sf(4)
+
+
+def test_the_shadow_of_an_occulter_is_not_continued_beyond_the_border():
+    image = noise(level=1000)
+    image[448:] -= 900  # the last row of cells
+    pre = run(counts(image))
+    # A line through the last two cells' levels would go on to -350 and leave a ghost of +450.
+    assert abs(pre.smoothed[-20:].mean()) < 5
+    assert pre.mask[-20:].mean() < 10 * norm.sf(4)
+
+
+@pytest.mark.parametrize("cell", [8, 64, 1024])
+def test_cells_of_any_size_fit_any_image(cell: int):
+    image = counts(noise((101, 237)))
+    pre = run(image, background_cell_px=cell)
+    assert pre.image.shape == pre.smoothed.shape == pre.mask.shape == image.shape
+    assert pre.noise_ratio.shape == (max(1, round(101 / cell)), max(1, round(237 / cell)))
+    assert pre.background == pytest.approx(1000, abs=1)
+    assert pre.pixel_noise == pytest.approx(20, rel=0.1)
+
+
+# Defects
+
+
+@pytest.mark.parametrize("sigma", [0.6, 0.8, 1.0, 2.0])
+@pytest.mark.parametrize("flux", [500, 50_000])
+def test_stars_stay_as_they_are(sigma: float, flux: float):
+    """Noise-free stars at 10 x 10 phases within the pixel, one image of them all."""
+    image = np.full((300, 300), 1000.0)
+    for i in range(10):
+        for j in range(10):
+            spot = integrated_star(7 + i / 10, 7 + j / 10, sigma, flux, (20, 20))
+            image[30 * i + 5 : 30 * i + 25, 30 * j + 5 : 30 * j + 25] += spot
+    image = (image + np.random.default_rng(5).normal(0, 0.5, image.shape)).astype(np.float32)
+    kept = run(image, hot_pixels="keep", background="none").image
+    replaced = run(image, hot_pixels="replace", background="none").image
+    assert np.array_equal(kept, image)
+    assert np.array_equal(replaced, image)
+
+
+def test_faint_stars_in_noise_lose_next_to_nothing():
+    image = counts(with_stars(noise((1024, 1024)), 2000, 900))  # peaks of 7 sigma
+    kept, replaced = (run(image, hot_pixels=choice) for choice in ("keep", "replace"))
+    # A centred star of sigma 1 has neighbours of 0.61 of its peak; all eight of them have to
+    # fall under 0.25 of it by chance.
+    assert np.count_nonzero(kept.image != replaced.image) <= 2
+
+
+def test_hot_pixels_are_replaced():
+    random = np.random.default_rng(6)
+    sky = noise()
+    hot = sky.copy()
+    # On a grid with random places in it: no two touch; the border and the corners are among them.
+    y, x = (g.ravel() + random.integers(0, 4, 1024) for g in np.mgrid[:512:16, :512:16])
+    y = np.concatenate([y, [0, 0, 511, 511, 0, 511, 200, 310]])
+    x = np.concatenate([x, [9, 511, 10, 511, 250, 250, 511, 511]])
+    hot[y, x] = 1000 + random.uniform(10 * 20, 60_000, y.size)
+    pre = run(counts(hot))
+    left = pre.image[y, x]
+    # A median of eight neighbours is what stands there now.
+    assert np.abs(left).max() < 3.5 * 20
+    assert left.std() < 0.6 * 20
+    untouched = np.ones(hot.shape, bool)
+    untouched[y, x] = False
+    kept = run(counts(hot), hot_pixels="keep")
+    assert np.array_equal(pre.image[untouched], kept.image[untouched])
+    assert pre.mask.mean() < 4 * norm.sf(4)
+    assert pre.pixel_noise == pytest.approx(20, rel=0.03)
+
+
+def test_a_hot_pixel_is_replaced_over_a_pedestal_too():
+    image = noise()
+    image[100, 100] = 9000
+    pre = run(counts(image), background="none")
+    assert pre.image[100, 100] == pytest.approx(1000, abs=60)
+
+
+# Images of every kind
+
+
+def test_types_agree():
+    image = counts(with_stars(noise(level=100, std=5), 20, 1000), np.uint8)
+    results = [run(image.astype(dtype)) for dtype in (np.uint8, np.uint16, np.float32)]
+    for other in results[1:]:
+        # A float image is taken to be rounded more finely, which changes the clipping a little:
+        # 2 % of the noise.
+        np.testing.assert_allclose(other.smoothed, results[0].smoothed, atol=0.1)
+        assert other.noise == pytest.approx(results[0].noise, rel=0.01)
+        assert np.mean(other.mask != results[0].mask) < 1e-4
+
+
+def test_either_byte_order_reads_the_same():
+    image = counts(noise())
+    swapped = image.astype(">u2")
+    assert np.array_equal(run(image).smoothed, run(swapped).smoothed)
+
+
+def test_the_image_is_not_changed():
+    image = with_stars(noise(), 20, 20_000).astype(np.float32)
+    image[3, 3], image[4, 9] = np.nan, 60_000
+    before = image.copy()
+    run(image)
+    assert np.array_equal(image, before, equal_nan=True)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 3.4e38, -3.4e38, 1e20])
+def test_missing_pixels_count_as_background(bad: float):
+    image = noise().astype(np.float32)
+    reference = run(image)
+    image[::16, ::16] = bad  # 1,024 pixels, a quarter of them among the samples of the cells
+    image[200:230, 100:140] = bad
+    pre = run(image)
+    assert np.isfinite(pre.smoothed).all()
+    assert pre.background == pytest.approx(reference.background, abs=1)
+    assert pre.noise == pytest.approx(reference.noise, rel=0.03)
+    assert np.abs(pre.image[200:230, 100:140]).max() < 20
+    assert pre.mask.mean() < 4 * norm.sf(4)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 3e38])
+def test_an_image_without_a_finite_pixel_is_refused(bad: float):
+    with pytest.raises(ValueError, match=r"^no pixel of the image is a finite number$"):
+        run(np.full((32, 32), bad, np.float32))
+
+
+@pytest.mark.parametrize("preset", ["robust", "paper_opencv", "paper_matlab"])
+@pytest.mark.parametrize(
+    ("dtype", "value"),
+    [(np.uint8, 0), (np.uint8, 255), (np.uint16, 65535), (np.float32, 0), (np.float32, -7.25)],
+)
+def test_an_image_of_one_value_has_no_object_and_a_noise(preset: str, dtype, value: float):
+    pre = preprocess(np.full((80, 64), value, dtype), Parameters.preset(preset))
+    assert not pre.mask.any()
+    assert pre.background == value
+    assert (pre.pixel_noise > 0, pre.noise > 0) == (True, True)
+    assert np.isfinite(pre.noise_ratio).all()
+    assert pre.noise_ratio.min() > 0
+    if dtype is not np.float32:
+        # What rounding leaves: 1 DN / sqrt(12), and of that, smoothed.
+        assert pre.pixel_noise == pytest.approx(1 / math.sqrt(12), rel=1e-5)
+        assert pre.noise == pytest.approx(SMOOTHED / math.sqrt(12), rel=1e-3)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_stars_on_a_black_sky_without_noise_are_found(dtype):
+    """As compressed video has it."""
+    image = np.zeros((256, 256))
+    centres = [(40.3, 50.1), (128.0, 200.5), (220.7, 90.2)]
+    for x, y in centres:
+        image += integrated_star(x, y, 1.0, 1200, image.shape)
+    image = np.rint(image).astype(dtype)
+    pre = run(image)
+    assert pre.background == 0
+    assert 0 < pre.noise < 1
+    near = np.zeros(image.shape, bool)
+    for x, y in centres:
+        assert pre.mask[round(y), round(x)] == 1
+        near[round(y) - 7 : round(y) + 8, round(x) - 7 : round(x) + 8] = True
+    assert not pre.mask[~near].any()
+
+
+@pytest.mark.parametrize("shape", [(16, 16), (16, 500), (17, 31), (65, 63), (200, 97)])
+@pytest.mark.parametrize("background", ["mesh", "none"])
+def test_images_of_any_size(shape: tuple[int, int], background: str):
+    image = noise(shape, seed=8)
+    x, y = shape[1] // 2, shape[0] // 2
+    image += integrated_star(x, y, 1.0, 6000, shape)
+    pre = run(counts(image), background=background)
+    assert pre.mask.shape == shape
+    assert pre.mask[y, x] == 1
+    # 256 pixels know their noise to 5 %, and the star is among them.
+    assert pre.pixel_noise == pytest.approx(20, rel=0.2)
+    assert pre.background == pytest.approx(1000, abs=5)
+
+
+def test_a_view_with_strides_is_read_as_a_copy():
+    image = counts(noise((600, 700)))
+    assert np.array_equal(run(image[::2, 100:612]).mask, run(image[::2, 100:612].copy()).mask)
+
+
+def test_half_the_image_saturated():
+    image = noise()
+    image[:, :256] = 65535
+    pre = run(counts(image))
+    assert np.isfinite(pre.smoothed).all()
+    right = pre.mask[:, 330:]
+    assert right.mean() < 4 * norm.sf(4)
+
+
+@pytest.mark.parametrize("scale", [2.0**-20, 2.0**20])
+def test_a_float_image_may_have_any_unit(scale: float):
+    image = with_stars(noise(), 30, 3000).astype(np.float32)
+    plain, scaled = run(image), run(image * np.float32(scale))
+    assert np.mean(plain.mask != scaled.mask) < 1e-4
+    assert scaled.noise == pytest.approx(plain.noise * scale, rel=1e-3)
