@@ -2,7 +2,8 @@
 
 ``process`` runs the same `Pipeline` as the detector node over a recording; ``simulate`` makes a
 recording with truth.  Exit code 0: done; 1: the input or output is not usable; 2: bad usage;
-130: stopped by Ctrl-C, with what was done so far on disk.
+130: stopped by Ctrl-C, with what was done so far on disk.  The summary goes to standard output;
+progress, notes and errors to standard error.
 """
 
 from __future__ import annotations
@@ -10,8 +11,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import click
 from tqdm import tqdm
@@ -25,7 +27,7 @@ from ofsat_ros.parameters import (
     preset_names,
 )
 from ofsat_ros.pipeline import ImageError, Pipeline
-from ofsat_ros.recordings import BagWriter, RecordingError, open_recording
+from ofsat_ros.recordings import BagWriter, Recording, RecordingError, open_recording
 from ofsat_ros.results import DETECTIONS, STAR_FIELD, ResultWriter
 from ofsat_ros.simulation import SCENARIOS, scenario, write_truth
 
@@ -42,11 +44,12 @@ def main() -> None:
 def _parameter_options(command: Callable[..., None]) -> Callable[..., None]:
     """Add an option for each pipeline parameter, from the table."""
     for about in reversed(list(Parameters.describe())):
+        allowed = f"{about.allowed} {about.unit}".strip()
         option = click.option(
             f"--{about.name.replace('_', '-')}",
             about.name,
             type=_option_type(about),
-            help=f"{about.meaning} [{about.stage}; {about.allowed} {about.unit}]",
+            help=f"{about.meaning} [{about.stage}; {allowed}]",
         )
         command = option(command)
     return command
@@ -78,61 +81,65 @@ def process(
     **changes: Any,
 ) -> None:
     """Detect RSOs in RECORDING: a rosbag2 folder, a bare .mcap or .db3 file, or a ROS 1 bag."""
-    with ExitStack() as stack:
-        try:
-            given = {name: value for name, value in changes.items() if value is not None}
-            parameters = Parameters.preset(preset, **given)
+    try:
+        given = {name: value for name, value in changes.items() if value is not None}
+        parameters = Parameters.preset(preset, **given)
+    except ParameterError as error:
+        raise click.UsageError(str(error)) from error
+    totals = _Totals()
+    try:
+        with ExitStack() as stack:
             frames = stack.enter_context(open_recording(recording, topic))
             _claim(output, force)
             writer = stack.enter_context(ResultWriter(output))
-        except (ParameterError, RecordingError, OSError) as error:
-            _fail(error)
-        totals = _Totals()
-        try:
             _process(frames, Pipeline(parameters), writer, totals)
-        except (RecordingError, OSError) as error:
-            _fail(error)
-        except KeyboardInterrupt:
-            _say(f"stopped; {totals} so far, in {output}")
-            sys.exit(130)
-        for problem in frames.problems:
-            _say(f"note: {problem}")
-    _say(f"{totals}; {DETECTIONS} and {STAR_FIELD} are in {output}")
+    except (RecordingError, OSError) as error:
+        _fail(error)
+    except KeyboardInterrupt:
+        _say(f"stopped; {totals} so far, in {output}")
+        sys.exit(130)
     if not totals.frames:
-        sys.exit(1)
+        _fail(f"no frame of {recording} could be processed")
+    click.echo(f"{totals}; {DETECTIONS} and {STAR_FIELD} are in {output}")
 
 
 class _Totals:
     """Counts for the summary."""
 
     def __init__(self) -> None:
-        self.frames = self.detections = self.refused = 0
+        self.frames = self.detections = self.left_out = 0
         self.reason = ""
 
     def __str__(self) -> str:
         words = f"{self.detections} RSO detections in {self.frames} frames"
-        if self.refused:
-            words += f" ({self.refused} more could not be processed)"
+        if self.left_out:
+            words += f" ({self.left_out} more could not be processed)"
         if not self.detections and self.reason:
             words += f"; the last frame says: {self.reason}"
         return words
 
 
-def _process(frames: Any, pipeline: Pipeline, writer: ResultWriter, totals: _Totals) -> None:
-    for frame in tqdm(frames, unit=" frames", dynamic_ncols=True, disable=None):
+def _process(frames: Recording, pipeline: Pipeline, writer: ResultWriter, totals: _Totals) -> None:
+    refused = 0
+    for given, frame in enumerate(tqdm(frames, unit=" frames", dynamic_ncols=True, disable=None)):
+        # Its number in the recording, which counts those that could not be decoded.
+        number = given + frames.skipped
         try:
             result = pipeline.process(frame.image, frame.stamp_ns)
         except ImageError as error:
-            totals.refused += 1
-            if totals.refused == 1:
-                _say(f"note: the frame stamped {frame.stamp_ns} is left out: {error}")
+            refused += 1
+            if refused == 1:
+                _say(f"note: frame {number} is left out, and others like it: {error}")
             continue
         if result.reset and totals.frames:
-            _say(f"note: frame {result.frame} starts afresh: {result.reset}")
-        writer.add(result)
+            _say(f"note: frame {number} starts afresh: {result.reset}")
+        writer.add(replace(result, frame=number))
         totals.frames += 1
         totals.detections += len(result.detections)
         totals.reason = result.reason
+    totals.left_out = refused + frames.skipped
+    for problem in frames.problems:
+        _say(f"note: {problem}")
 
 
 @main.command()
@@ -168,11 +175,14 @@ def simulate(
     changes: dict[str, Any] = {"frames": frames, "bit_depth": bit_depth}
     if size:
         changes.update(width=size[0], height=size[1])
-    truth = output.with_name(output.name + ".truth.csv")
-    topic = IMAGE_TOPIC + ("/compressed" if compressed else "")
     try:
         sky = scenario(name, seed, **{k: v for k, v in changes.items() if v is not None})
-        rows = []
+    except ParameterError as error:
+        raise click.UsageError(str(error)) from error
+    truth = Path(f"{output}.truth.csv")
+    topic = IMAGE_TOPIC + ("/compressed" if compressed else "")
+    rows = []
+    try:
         with BagWriter(output, storage=storage, compression="none", force=force) as bag:
             for frame in tqdm(sky, total=len(sky), unit=" frames", disable=None):
                 bag.write_image(
@@ -180,13 +190,13 @@ def simulate(
                 )
                 rows.append(frame.truth)
         write_truth(truth, rows)
-    except (ParameterError, RecordingError, OSError) as error:
+    except (RecordingError, OSError) as error:
         _fail(error)
     except KeyboardInterrupt:
         write_truth(truth, rows)
-        _say(f"stopped; {len(rows)} frames are in {output}")
+        _say(f"stopped; {len(rows)} frames are in {output}, their truth in {truth}")
         sys.exit(130)
-    _say(f"{len(rows)} frames on {topic} in {output}, truth in {truth}")
+    click.echo(f"{len(rows)} frames on {topic} are in {output}, their truth in {truth}")
 
 
 def _claim(folder: Path, force: bool) -> None:
@@ -200,7 +210,9 @@ def _claim(folder: Path, force: bool) -> None:
         )
 
 
-def _fail(error: Exception) -> None:
+def _fail(error: Exception | str) -> NoReturn:
+    if isinstance(error, OSError) and error.strerror:
+        error = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     _say(f"ofsat: {error}")
     sys.exit(1)
 

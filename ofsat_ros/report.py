@@ -59,13 +59,19 @@ def annotate(
 def _stretch(image: NDArray[np.generic], result: FrameResult) -> NDArray[np.uint8]:
     """8 bits that show faint stars: asinh over the background, in units of its noise."""
     noise = result.noise if np.isfinite(result.noise) and result.noise > 0 else 1.0
-    level = (
-        result.background
-        if np.isfinite(result.background)
-        else float(np.median(image.astype(np.float32)))
-    )
-    # The smoothed noise is about a third of the pixel noise; 12 of it are some four of those.
-    value = np.maximum((image.astype(np.float32) - np.float32(level)) / np.float32(12 * noise), 0)
+    level = result.background
+    if not np.isfinite(level):
+        level = float(np.median(image.astype(np.float32)))
+    if image.dtype.kind == "u":  # of each value that there may be, not of each pixel
+        values = np.arange(256**image.dtype.itemsize, dtype=np.float32)
+        return _asinh(values, level, noise)[image]
+    return _asinh(image.astype(np.float32), level, noise)
+
+
+def _asinh(values: NDArray[np.float32], level: float, noise: float) -> NDArray[np.uint8]:
+    with np.errstate(over="ignore"):  # an infinity is shown white
+        # The smoothed noise is about a third of the pixel noise; 12 of it are some four of those.
+        value = np.maximum((values - np.float32(level)) / np.float32(12 * noise), 0)
     shown = np.arcsinh(np.nan_to_num(value)) * np.float32(55) + np.float32(18)
     return np.minimum(shown, 255).astype(np.uint8)
 

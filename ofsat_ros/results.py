@@ -8,6 +8,7 @@ so that a file reads the same whoever made it.  Times are int ns UTC, angles in 
 from __future__ import annotations
 
 import math
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Self, TextIO
@@ -107,21 +108,21 @@ class ResultWriter:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._detections = _start(folder / DETECTIONS, DETECTION_COLUMNS)
-        self._star_field = _start(folder / STAR_FIELD, STAR_FIELD_COLUMNS)
+        with ExitStack() as files:
+            self._detections = files.enter_context(_start(folder / DETECTIONS, DETECTION_COLUMNS))
+            self._star_field = files.enter_context(_start(folder / STAR_FIELD, STAR_FIELD_COLUMNS))
+            self._files = files.pop_all()
 
     def add(self, result: FrameResult) -> None:
         """Write what one frame gave."""
         lines = detection_lines(result.stamp_ns, result.frame, result.detections)
-        self._detections.writelines(lines)
+        # One write: Ctrl-C leaves no part of a line.
+        self._detections.write("".join(lines))
         self._star_field.write(_star_field_line(result))
-        self._detections.flush()
-        self._star_field.flush()
 
     def close(self) -> None:
         """Close the files."""
-        self._detections.close()
-        self._star_field.close()
+        self._files.close()
 
     def __enter__(self) -> Self:
         return self
@@ -154,7 +155,8 @@ def _star_field_line(result: FrameResult) -> str:
 
 
 def _start(path: Path, columns: tuple[str, ...]) -> TextIO:
-    file = path.open("w", encoding="utf-8", newline="\n")
+    # Line-buffered: each line is on disk once it is written.
+    file = path.open("w", 1, encoding="utf-8", newline="\n")
     file.write(",".join(columns) + "\n")
     return file
 
