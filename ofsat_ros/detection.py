@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ofsat_ros.optical_flow import Flow, FlowInput, sample
+from ofsat_ros.optical_flow import Flow, FlowInput
 from ofsat_ros.star_field import StarFieldMotion
 
 CANDIDATE, CONFIRMED = 0, 1
@@ -112,8 +112,8 @@ def _was_there(
     source seen `relative` away from its centre has fallen to exp(-relative^2 / (4 width^2)), and
     the brightness must be nearer to that than to constancy.
     """
-    now = sample(current.smoothed, flow.position)
-    before = sample(previous.smoothed, flow.position - field.displacement_at(flow.position))
+    now = current.brightness_at(flow.position)
+    before = previous.brightness_at(flow.position - field.displacement_at(flow.position))
     fallen = np.exp(-np.sum(relative**2, axis=1) / (4 * _POINT_WIDTH_PX**2))
     slack = previous.noise + current.noise
     return before > now * (1 + fallen) / 2 - slack

@@ -21,9 +21,11 @@ Array = NDArray[np.float64]
 Plane = NDArray[np.float32]
 
 # What Lucas-Kanade adds to the uncertainty of two centroids, px (measured: docs/algorithm.md).
-_FLOW_FLOOR_PX = 0.05
+_FLOW_FLOOR_PX = 0.02
 # The 8 bits of the stretch "noise": where they start and what they span, in sigmas of the noise.
-_STRETCH_LOW, _STRETCH_SPAN = 2.0, 80.0
+_STRETCH_LOW, _STRETCH_SPAN = 2.0, 200.0
+# OpenCV's own limit would drop stars of few grey levels; `_brightness_kept` judges them better.
+_LEAST_EIGENVALUE = 1e-6
 # Lengths of streak, px, up to which a window is enlarged by that much; the first not at all.
 _STREAK_CLASSES_PX = (3, 6, 12, 24, 48, 96)
 # The brightness at the two ends of a vector may differ by this factor, beyond the noise.
@@ -59,6 +61,27 @@ class FlowInput:
     sigma: Array
     length: Array
     noise: float
+
+    def brightness_at(self, xy: Array) -> Array:
+        """Smoothed brightness between the pixels, DN: bilinear interpolation.
+
+        Parameters
+        ----------
+        xy : (N, 2) float64
+            Points, px; those outside take the value at the border.
+
+        Returns
+        -------
+        (N,) float64
+        """
+        # cv2.remap would end at 32,767 points
+        limit = np.array(self.smoothed.shape[::-1]) - 1
+        near = np.clip(xy, 0, limit)
+        x, y = np.minimum(near.astype(np.intp), limit - 1).T
+        fx, fy = near[:, 0] - x, near[:, 1] - y
+        top = self.smoothed[y, x] * (1 - fx) + self.smoothed[y, x + 1] * fx
+        bottom = self.smoothed[y + 1, x] * (1 - fx) + self.smoothed[y + 1, x + 1] * fx
+        return top * (1 - fy) + bottom * fy
 
 
 @dataclass(frozen=True)
@@ -189,11 +212,12 @@ class SparseLucasKanade:
             maxLevel=self._parameters.pyramid_levels,
             criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.003),
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+            minEigThreshold=_LEAST_EIGENVALUE,
         )
         xy = found.reshape(-1, 2).astype(np.float64)
         ok = (status.ravel() == 1) & _inside(xy, end.shape)
         # OpenCV leaves the error of a lost point undefined.
-        return xy, ok, np.where(ok, np.nan_to_num(error.ravel().astype(np.float64)), np.inf)
+        return xy, ok, np.where(ok, error.ravel(), np.inf)
 
     def _follow_streaks(
         self, start: NDArray[np.uint8], end: NDArray[np.uint8], frame: FlowInput, guess: Array
@@ -286,7 +310,6 @@ class DenseLucasKanade:
         noise = (previous.noise, current.noise)
         images = (previous.smoothed, current.smoothed)
         if native:
-            images = (images[0] * previous.mask, images[1] * current.mask)
             velocity, solved = self.velocity_map(*images, *noise, guesses[0])
             return self._regions(velocity, solved, current)
         runs = []
@@ -336,11 +359,13 @@ class DenseLucasKanade:
                 size = (b.shape[1], b.shape[0])
                 velocity = 2 * cv2.resize(velocity, size, interpolation=cv2.INTER_LINEAR)
             for _ in range(p.dense_iterations):
+                # cv2.remap knows 32nds of a pixel: what it would round away must not be counted.
+                velocity = np.rint(velocity * 32) / 32
                 step, solved = self._solve(_warp(a, velocity), b, noise)
                 if p.dense_iterations > 1:
                     # Derivatives say nothing beyond the width of a star; a larger step is noise.
                     np.clip(step, -2, 2, out=step)
-                velocity = velocity + step
+                velocity += step
         velocity[~solved] = 0
         return velocity, solved
 
@@ -351,25 +376,25 @@ class DenseLucasKanade:
         ix = cv2.sepFilter2D(middle, cv2.CV_32F, kernel, one)
         iy = cv2.sepFilter2D(middle, cv2.CV_32F, one, kernel)
         it = now - before
-        sxx, sxy, syy, sxt, syt = (
+        sums = [
             cv2.sepFilter2D(product, cv2.CV_32F, self._window, self._window)
             for product in (ix * ix, ix * iy, iy * iy, ix * it, iy * it)
-        )
-        half, gap = (sxx + syy) / 2, np.hypot((sxx - syy) / 2, sxy)
+        ]
         limit = self._parameters.dense_noise_threshold * self._noise_eigenvalue(noise)
-        full, one_way = half - gap > limit, half + gap > limit
-        step = np.zeros((*now.shape, 2), np.float32)
-        determinant = np.where(full, sxx * syy - sxy * sxy, 1)
-        step[..., 0] = np.where(full, (sxy * syt - syy * sxt) / determinant, 0)
-        step[..., 1] = np.where(full, (sxy * sxt - sxx * syt) / determinant, 0)
-        # Aperture problem: only the component along the eigenvector of the larger eigenvalue.
-        along = one_way & ~full
-        if along.any():
-            angle = np.arctan2(2 * sxy[along], (sxx - syy)[along]) / 2
-            ex, ey = np.cos(angle), np.sin(angle)
-            amount = -(ex * sxt[along] + ey * syt[along]) / (half + gap)[along]
-            step[along] = np.stack([amount * ex, amount * ey], axis=1)
-        return step, one_way
+        # The trace bounds the larger eigenvalue: elsewhere nothing can be solved.
+        y, x = np.nonzero(sums[0] + sums[2] > limit)
+        sxx, sxy, syy, sxt, syt = (total[y, x] for total in sums)
+        half, gap = (sxx + syy) / 2, np.hypot((sxx - syy) / 2, sxy)
+        large, small = half + gap, half - gap
+        angle = np.arctan2(2 * sxy, sxx - syy) / 2
+        ex, ey = np.cos(angle), np.sin(angle)
+        # Aperture problem: no motion along an eigenvector whose eigenvalue is noise.
+        along = -(ex * sxt + ey * syt) / np.where(large > limit, large, np.inf)
+        across = (ey * sxt - ex * syt) / np.where(small > limit, small, np.inf)
+        step, solved = np.zeros((*now.shape, 2), np.float32), np.zeros(now.shape, bool)
+        step[y, x, 0], step[y, x, 1] = along * ex - across * ey, along * ey + across * ex
+        solved[y, x] = large > limit
+        return step, solved
 
     def _noise_eigenvalue(self, noise: float) -> float:
         """Expected eigenvalue of the matrix where there is nothing but noise.
@@ -381,9 +406,13 @@ class DenseLucasKanade:
         return noise**2 / (4 * sigma**2)
 
     def _regions(self, velocity: Plane, solved: NDArray[np.bool_], current: FlowInput) -> Flow:
-        """Cut the objects out of the map of speeds, as published."""
+        """Cut the objects out of the map of speeds, as published.
+
+        The threshold is applied to the map: I_f falls to 0 from the background's level, and the
+        derivatives of that cliff would hide the stars' own.
+        """
         speed = np.hypot(velocity[..., 0], velocity[..., 1])
-        moving = solved & (speed > self._parameters.dense_min_speed_px)
+        moving = solved & (current.mask > 0) & (speed > self._parameters.dense_min_speed_px)
         count, regions = cv2.connectedComponents(moving.astype(np.uint8), ltype=cv2.CV_32S)
         flow = self._combine(velocity, moving, regions, current, count - 1)
         index = _labels_at(current.labels, flow.position)
@@ -438,7 +467,9 @@ def _select(runs: list[Flow], kept: list[NDArray[np.bool_]]) -> Flow:
     choice = np.argmax(np.stack(kept), axis=0), np.arange(len(runs[0]))
     values = {name: np.stack([getattr(run, name) for run in runs])[choice] for name in
               runs[0].__dict__}  # fmt: skip
-    return Flow(**{**values, "valid": np.stack(kept)[choice]})
+    valid = np.stack(kept)[choice]
+    displacement = np.where(valid[:, None], values["displacement"], 0.0)
+    return Flow(**{**values, "valid": valid, "displacement": displacement})
 
 
 def _group_median(values: Array, label: NDArray[np.intp], number: NDArray[np.intp]) -> Array:
@@ -457,8 +488,9 @@ def _warp(image: Plane, velocity: Plane) -> Plane:
         return image
     height, width = image.shape
     gx, gy = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    # OpenCV's cubic kernel would shift a star by up to 0.05 px, its linear one flatten it.
     return cv2.remap(
-        image, gx - velocity[..., 0], gy - velocity[..., 1], cv2.INTER_CUBIC,
+        image, gx - velocity[..., 0], gy - velocity[..., 1], cv2.INTER_LANCZOS4,
         borderMode=cv2.BORDER_REPLICATE,
     )  # fmt: skip
 
@@ -486,34 +518,9 @@ def _brightness_kept(
     Lucas-Kanade rests on constant brightness; a vector that ends where the previous frame was dark
     measured nothing.
     """
-    before = sample(previous.smoothed, start)
-    now = sample(current.smoothed, end)
+    before, now = previous.brightness_at(start), current.brightness_at(end)
     slack = 3 * (previous.noise + current.noise)
     similar = (now <= _BRIGHTNESS_RATIO * before + slack) & (
         before <= _BRIGHTNESS_RATIO * now + slack
     )
     return similar & _inside(start, previous.smoothed.shape) & (before > 2 * previous.noise)
-
-
-def sample(image: Plane, xy: Array) -> Array:
-    """Brightness at points between the pixels.
-
-    Parameters
-    ----------
-    image : (H, W) float32
-        Any image.
-    xy : (N, 2) float64
-        Points, px; those outside take the value at the border.
-
-    Returns
-    -------
-    (N,) float64
-        Bilinear interpolation (`cv2.remap` would end at 32,767 points).
-    """
-    limit = np.array(image.shape[::-1]) - 1
-    near = np.clip(xy, 0, limit)
-    x, y = np.minimum(near.astype(np.intp), limit - 1).T
-    fx, fy = near[:, 0] - x, near[:, 1] - y
-    top = image[y, x] * (1 - fx) + image[y, x + 1] * fx
-    bottom = image[y + 1, x] * (1 - fx) + image[y + 1, x + 1] * fx
-    return top * (1 - fy) + bottom * fy

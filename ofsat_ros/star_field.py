@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -170,8 +171,9 @@ def vote_shift(
     counts = np.bincount(cell[:, 0] * size[1] + cell[:, 1], minlength=size[0] * size[1])
     counts = counts.reshape(size)
     # A peak may lie on a cell's border: count each cell with its neighbours.
-    shifts = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-    near = np.sum([np.roll(counts, shift, (0, 1)) for shift in shifts], axis=0)
+    near = cv2.boxFilter(
+        counts.astype(np.float32), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT
+    )
     best = np.unravel_index(np.argmax(near), near.shape)
     chance = 9 * len(votes) / max(1, int(np.count_nonzero(near)))
     needed = 1 if min(a.size, b.size) == 1 else max(2.0, chance + 4 * np.sqrt(chance))
