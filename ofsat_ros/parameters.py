@@ -304,7 +304,7 @@ class Parameters(Table):
         " uncertainty; speed: its speed lies outside mean +- k std, as published",
     )
     rso_sigmas: float = _number(
-        7.0, 0.5, 100.0, "", "detection", "k of the RSO test, in sigmas of the vector or the speed"
+        6.0, 0.5, 100.0, "", "detection", "k of the RSO test, in sigmas of the vector or the speed"
     )
     min_relative_px: float = _number(
         0.3,

@@ -78,15 +78,15 @@ def _asinh(values: NDArray[np.float32], level: float, noise: float) -> NDArray[n
 
 def _draw_vector(
     picture: NDArray[np.uint8],
-    tip: NDArray[np.float64],
+    origin: NDArray[np.float64],
     vector: NDArray[np.float64],
     zoom: int,
     colour: tuple[int, int, int],
 ) -> None:
-    """A line that ends where the object is, and a dot there so that no motion shows, too."""
-    end, start = _fixed(tip, zoom), _fixed(tip - vector, zoom)
+    """A line from the object to where it goes, and a dot on it so that no motion shows, too."""
+    start, end = _fixed(origin, zoom), _fixed(origin + vector, zoom)
     cv2.line(picture, start, end, colour, 1, cv2.LINE_AA, _SHIFT)
-    cv2.circle(picture, end, 2 << _SHIFT, colour, 1, cv2.LINE_AA, _SHIFT)
+    cv2.circle(picture, start, 2 << _SHIFT, colour, 1, cv2.LINE_AA, _SHIFT)
 
 
 def _draw_rso(picture: NDArray[np.uint8], rso: np.void, seconds: float, zoom: int) -> None:

@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 
 # Objects that take part in a vote: its cost is their number squared.
 _VOTERS = 150
+# Cells of the coarse vote, along each axis.
+_VOTE_CELLS = 512
 # Vectors among which the mode is sought that the robust fit starts from.
 _MODE_VECTORS = 400
 # A similarity has four parameters; with fewer stars than this their scatter goes into them.
@@ -165,22 +167,32 @@ def vote_shift(
     votes = shift[np.abs(ratio) < np.log(1.5)]
     if not len(votes):
         return None
-    low = votes.min(axis=0)
-    cell = ((votes - low) / bin_px).astype(np.intp) + 1
-    size = cell.max(axis=0) + 2
-    counts = np.bincount(cell[:, 0] * size[1] + cell[:, 1], minlength=size[0] * size[1])
-    counts = counts.reshape(size)
+    # First coarsely over all displacements, then finely around the best: the cost of counting is
+    # that of the cells, and a field may move by as much as the image is wide.
+    extent = float(np.max(np.ptp(votes, axis=0)))
+    coarse, chance = _densest(votes, max(bin_px, extent / _VOTE_CELLS))
+    few = min(a.size, b.size) == 1
+    if not few and len(coarse) < max(2.0, chance + 4 * np.sqrt(chance)):
+        return None
+    return np.median(_densest(coarse, bin_px)[0], axis=0)
+
+
+def _densest(votes: Array, cell_px: float) -> tuple[Array, float]:
+    """The votes in the densest 3 x 3 cells, and how many such cells hold by chance."""
+    cell = ((votes - votes.min(axis=0)) / cell_px).astype(np.intp) + 1
+    columns, rows = cell.max(axis=0) + 2
+    counts = np.bincount(cell[:, 0] * rows + cell[:, 1], minlength=columns * rows)
     # A peak may lie on a cell's border: count each cell with its neighbours.
     near = cv2.boxFilter(
-        counts.astype(np.float32), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT
+        counts.reshape(columns, rows).astype(np.float32),
+        -1,
+        (3, 3),
+        normalize=False,
+        borderType=cv2.BORDER_CONSTANT,
     )
     best = np.unravel_index(np.argmax(near), near.shape)
     chance = 9 * len(votes) / max(1, int(np.count_nonzero(near)))
-    needed = 1 if min(a.size, b.size) == 1 else max(2.0, chance + 4 * np.sqrt(chance))
-    if near[best] < needed:
-        return None
-    agreeing = np.all(np.abs(cell - best) <= 1, axis=1)
-    return np.median(votes[agreeing], axis=0)
+    return votes[np.all(np.abs(cell - best) <= 1, axis=1)], chance
 
 
 def _mean_motion(
