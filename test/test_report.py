@@ -135,9 +135,9 @@ def test_an_rso_has_a_red_box_and_vector():
     for part in (0.1, 0.7, 0.95):
         place = np.rint(RSO + part * (tip - RSO)).astype(int)
         assert mask[place[1] - 1 : place[1] + 2, place[0] - 1 : place[0] + 2].any()
-    # On the other side is only the box.
-    beyond = np.rint(RSO - RSO_STEP * 3.5).astype(int)
-    assert not mask[beyond[1] - 2 : beyond[1] + 3, beyond[0] - 2 : beyond[0] + 3].any()
+    # On the other side is nothing, inside the box.
+    beyond = np.rint(RSO - RSO_STEP).astype(int)
+    assert not mask[beyond[1] - 1 : beyond[1] + 2, beyond[0] - 1 : beyond[0] + 2].any()
 
 
 def test_a_streaks_box_is_as_much_larger_as_it_is_long():
