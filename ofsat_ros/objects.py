@@ -6,6 +6,8 @@ of these objects.  An object is a star, an RSO or an artefact; this stage does n
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +38,6 @@ def find_objects(
     noise_ratio: NDArray[np.float32],
     min_area_px: int = 1,
     max_objects: int = 5000,
-    pedestal: float = 0.0,
 ) -> tuple[NDArray[np.void], NDArray[np.int32]]:
     """Measure the connected regions of a mask.
 
@@ -53,7 +54,7 @@ def find_objects(
     Parameters
     ----------
     image, smoothed : (H, W) float32
-        The image and its smoothed version, DN.
+        The image and its smoothed version, DN, less their background.
     mask : (H, W) uint8
         Nonzero inside objects.
     pixel_noise, noise : float
@@ -64,8 +65,6 @@ def find_objects(
         Smaller regions are left out.
     max_objects : int
         The regions with the largest SNR are kept.
-    pedestal : float
-        Level of the background in `image` and `smoothed`, DN; 0 if it was subtracted.
 
     Returns
     -------
@@ -75,61 +74,85 @@ def find_objects(
         1 + index of the object that a pixel belongs to, 0 for none.
     """
     inside = cv2.findNonZero(mask)
+    labels = np.zeros(mask.shape, np.int32)
     if inside is None:
-        return np.zeros(0, OBJECT_DTYPE), np.zeros(mask.shape, np.int32)
+        return np.zeros(0, OBJECT_DTYPE), labels
     count, regions = cv2.connectedComponents(mask, connectivity=8, ltype=cv2.CV_32S)
     x, y = inside.reshape(-1, 2).T.astype(np.intp)
-    region = regions[y, x]
-    height, width = mask.shape
+    region = regions[y, x] - 1
+    moments = _moments(region, count - 1, x, y, smoothed[y, x].astype(np.float64), noise)
 
     def total(weights: NDArray[np.generic] | None = None) -> NDArray[np.float64]:
-        return np.bincount(region, weights, count)[1:].astype(np.float64)
+        return np.bincount(region, weights, count - 1).astype(np.float64)
 
-    value = smoothed[y, x].astype(np.float64) - pedestal
-    raw = image[y, x].astype(np.float64) - pedestal
+    raw = image[y, x].astype(np.float64)
     area = total()
-    # Every weight is positive, also where a published threshold lies below the background.
-    lowest = np.full(count, np.inf)
-    np.minimum.at(lowest, region, value)
-    weight = value - np.minimum(lowest[region], 0) + 1e-6 * noise
-    norm = total(weight)
-    square = weight**2
-    cx, cy = (total(square * place) / total(square) for place in (x, y))
-    dx, dy = x - cx[region - 1], y - cy[region - 1]
-    # A pixel is a square of side 1: its variance keeps a single pixel from having none.
-    xx = total(weight * dx * dx) / norm + 1 / 12
-    yy = total(weight * dy * dy) / norm + 1 / 12
-    xy = total(weight * dx * dy) / norm
-    peak = np.full(count, -np.inf)
-    np.maximum.at(peak, region, value)
-
-    local = _sample_mesh(noise_ratio, cx, cy, mask.shape)
+    local = _sample_mesh(noise_ratio, moments["x"], moments["y"], mask.shape)
     energy = total(raw * raw) / (pixel_noise * local) ** 2 - area
-    snr = np.maximum(peak[1:] / (noise * local), np.sqrt(np.maximum(energy, 0)))
-    split = np.hypot((xx - yy) / 2, xy)
+    snr = np.maximum(moments["peak"] / (noise * local), np.sqrt(np.maximum(energy, 0)))
     objects = np.zeros(count - 1, OBJECT_DTYPE)
-    objects["x"], objects["y"], objects["area"] = cx, cy, area
-    objects["flux"], objects["peak"], objects["snr"] = total(raw), peak[1:], snr
-    spread = _untruncated(lowest[1:] / np.maximum(peak[1:], 1e-9))
-    objects["sigma_x"], objects["sigma_y"] = (
-        np.sqrt(2 * moment * spread) / np.maximum(snr, 1) for moment in (xx, yy)
-    )
-    # A round object's moments differ by chance: by its SNR (97 % of them by less than this), and
-    # by the pixel grid.
-    chance = np.maximum(0.25, 10 / np.maximum(snr, 1)) * ((xx + yy) / 2 - split)
-    objects["length"] = np.where(2 * split > chance, np.sqrt(12 * 2 * split), 0)
-    angle = np.arctan2(2 * xy, xx - yy) / 2
-    objects["angle"] = np.where(angle <= -np.pi / 2, np.pi / 2, angle)
+    objects["flux"], objects["snr"], objects["area"] = total(raw), snr, area
+    for name in ("x", "y", "peak"):
+        objects[name] = moments[name]
+    for name, moment in (("sigma_x", moments["xx"]), ("sigma_y", moments["yy"])):
+        objects[name] = np.sqrt(2 * moment * moments["untruncated"]) / np.maximum(snr, 1)
+    objects["length"], objects["angle"] = _streak(moments, snr)
+    height, width = mask.shape
     at_border = (x == 0) | (y == 0) | (x == width - 1) | (y == height - 1)
     objects["edge"] = total(at_border) > 0
 
     order = np.flatnonzero(area >= min_area_px)
     order = order[np.argsort(-snr[order], kind="stable")][:max_objects]
-    rank = np.zeros(count, np.int32)
-    rank[order + 1] = np.arange(1, order.size + 1)
-    labels = np.zeros(mask.shape, np.int32)
+    rank = np.zeros(count - 1, np.int32)
+    rank[order] = np.arange(1, order.size + 1)
     labels[y, x] = rank[region]
     return objects[order], labels
+
+
+def _moments(
+    region: NDArray[np.integer],
+    count: int,
+    x: NDArray[np.intp],
+    y: NDArray[np.intp],
+    value: NDArray[np.float64],
+    noise: float,
+) -> dict[str, NDArray[np.float64]]:
+    """Centroid, second moments and peak of each region from its pixels' smoothed values."""
+    lowest, peak = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(lowest, region, value)
+    np.maximum.at(peak, region, value)
+    # Every weight is positive, also where a published threshold lies below the background.
+    weight = value - np.minimum(lowest[region], 0) + 1e-6 * noise
+
+    def mean(values: NDArray[Any], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.bincount(region, weights * values, count) / np.bincount(region, weights, count)
+
+    cx, cy = mean(x, weight**2), mean(y, weight**2)
+    dx, dy = x - cx[region], y - cy[region]
+    return {
+        "x": cx,
+        "y": cy,
+        # A pixel is a square of side 1: its variance keeps a single pixel from having none.
+        "xx": mean(dx * dx, weight) + 1 / 12,
+        "yy": mean(dy * dy, weight) + 1 / 12,
+        "xy": mean(dx * dy, weight),
+        "peak": peak,
+        "untruncated": _untruncated(lowest / np.maximum(peak, 1e-9)),
+    }
+
+
+def _streak(
+    moments: dict[str, NDArray[np.float64]], snr: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Length of each object's streak, px, 0 if it is round, and its angle, rad."""
+    xx, yy, xy = moments["xx"], moments["yy"], moments["xy"]
+    split = np.hypot((xx - yy) / 2, xy)
+    # A round object's moments differ by chance: by its SNR (97 % of them by less than this), and
+    # by the pixel grid.
+    chance = np.maximum(0.25, 10 / np.maximum(snr, 1)) * ((xx + yy) / 2 - split)
+    length = np.where(2 * split > chance, np.sqrt(12 * 2 * split), 0)
+    angle = np.arctan2(2 * xy, xx - yy) / 2
+    return length, np.where(angle <= -np.pi / 2, np.pi / 2, angle)
 
 
 def _untruncated(cut: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -202,7 +202,7 @@ class Parameters(Table):
         3, 1, 10000, "px", "objects", "smallest connected region that is an object"
     )
     max_objects: int = _number(
-        5000, 10, 100000, "", "objects", "at most this many objects, the brightest ones"
+        5000, 10, 100000, "", "objects", "at most this many objects, those of the highest SNR"
     )
     engine: str = _choice(
         "sparse dense",
@@ -236,7 +236,12 @@ class Parameters(Table):
         "side of the sparse engine's window (made odd); that of a streak is longer by its length",
     )
     pyramid_levels: int = _number(
-        0, 0, 8, "", "optical_flow", "pyramid levels above the image, sparse engine"
+        3,
+        0,
+        8,
+        "",
+        "optical_flow",
+        "pyramid levels above the image, sparse engine; objects get them if not found without",
     )
     max_corners: int = _number(
         1000, 1, 100000, "", "optical_flow", "corners kept, sparse engine with native targets"

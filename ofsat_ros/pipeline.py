@@ -56,8 +56,8 @@ class FrameResult:
     detections : (K,) DETECTION_DTYPE
         RSO candidates.
     background, noise, threshold : float
-        Median level of the background, std of the smoothed background, threshold of the smoothed
-        image (less its background if that was subtracted), DN.
+        Median level of the background, std of the smoothed background, threshold over the
+        background, DN.
     reason : str
         Why nothing was detected, in words; empty if something was.
     seconds : dict
@@ -78,6 +78,14 @@ class FrameResult:
     threshold: float = float("nan")
     reason: str = ""
     seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def star_rows(self) -> NDArray[np.intp]:
+        """Rows of the flow that are stars': they move with the field and are no detection's."""
+        if self.star_field is None:
+            return np.zeros(0, np.intp)
+        rows = np.flatnonzero(self.star_field.inliers)
+        return np.setdiff1d(rows, self.detections["flow_index"])
 
 
 @dataclass(frozen=True)
@@ -163,14 +171,12 @@ class Pipeline:
                 pre.noise_ratio,
                 parameters.min_area_px,
                 parameters.max_objects,
-                pre.pedestal,
             )
         xy, sigma = _pairs(result.objects, "x", "y"), _pairs(result.objects, "sigma_x", "sigma_y")
         length = result.objects["length"]
-        # What engines find by themselves is found in I_f as published, background and all.
-        native = parameters.flow_targets == "native" or not pre.pedestal
-        smoothed = pre.smoothed if native else pre.smoothed - np.float32(pre.pedestal)
-        current = FlowInput(smoothed, pre.mask, labels, xy, sigma, length, pre.noise)
+        current = FlowInput(
+            pre.smoothed, pre.mask, pre.pedestal, labels, xy, sigma, length, pre.noise
+        )
 
         previous = self._usable_previous(image, stamp_ns, parameters)
         result.reset, self._reset_reason = self._reset_reason, ""

@@ -37,22 +37,22 @@ class Preprocessed:
     Attributes
     ----------
     image : (H, W) float32
-        Image less its background if that is a mesh, defects replaced, DN.
+        Image less its background, defects replaced, DN.
     smoothed : (H, W) float32
-        The same, smoothed (I_s), DN.
+        The same, smoothed, DN: I_s less its background.
     mask : (H, W) uint8
         1 where `smoothed` is above the threshold.
     background : float
         Median level of the background, DN.
     pedestal : float
-        What `image` and `smoothed` still hold of it, DN: 0 if it was subtracted.
+        What I_s as published holds of it, DN: `background`, or 0 if a mesh was subtracted.
     pixel_noise, noise : float
         Std of the background in `image` and in `smoothed`, DN; the median over the image.
         Never 0: at least what quantisation leaves.
     noise_ratio : (ny, nx) float32
         Noise over its median, on a mesh of equal cells; one cell when it is not local.
     threshold : float
-        Threshold of `smoothed`, DN; the median over the image.
+        Threshold of `smoothed`, over the background, DN; the median over the image.
     """
 
     image: Image
@@ -64,11 +64,6 @@ class Preprocessed:
     noise: float
     noise_ratio: Image
     threshold: float
-
-    @property
-    def filtered(self) -> Image:
-        """I_f, (H, W) float32: `smoothed` where it is above the threshold, elsewhere 0."""
-        return self.smoothed * self.mask
 
 
 def preprocess(raw: NDArray[np.generic], parameters: Parameters) -> Preprocessed:
@@ -96,15 +91,14 @@ def preprocess(raw: NDArray[np.generic], parameters: Parameters) -> Preprocessed
     # A mesh needs a frame of cells to interpolate between; a small image is one cell.
     mesh = (max(1, round(raw.shape[0] / cell)), max(1, round(raw.shape[1] / cell)))
     level, _ = _mesh_statistics(image, mesh, rounding)
-    background = pedestal = float(np.median(level))
-    if parameters.background == "mesh":
-        image -= _background_map(level, image.shape)
-        pedestal = 0.0
+    # Without a mesh it is one number, whose subtraction changes no threshold.
+    image -= _background_map(level, image.shape)
+    background = float(np.median(level))
     # Of what is left: a gradient inside a cell is no noise.
     coarse = (min(mesh[0], _NOISE_CELLS), min(mesh[1], _NOISE_CELLS))
     pixel_noise = float(np.median(_mesh_statistics(image, coarse, rounding)[1]))
     if parameters.hot_pixels == "replace":
-        _replace_defects(image, pedestal, pixel_noise)
+        _replace_defects(image, pixel_noise)
 
     sigma = parameters.smoothing_sigma_px
     smoothed = cv2.GaussianBlur(image, (0, 0), sigma) if sigma > 0 else image.copy()
@@ -128,7 +122,7 @@ def preprocess(raw: NDArray[np.generic], parameters: Parameters) -> Preprocessed
         smoothed=smoothed,
         mask=cv2.min(mask, 1),
         background=background,
-        pedestal=pedestal,
+        pedestal=0.0 if parameters.background == "mesh" else background,
         pixel_noise=pixel_noise,
         noise=noise,
         noise_ratio=ratio,
@@ -153,8 +147,12 @@ def _rounding_noise(image: Image, dtype: np.dtype) -> float:
 
     Compressed black sky and simulated frames have a std of 0, which nothing may be divided by.
     """
-    low, high, _, _ = cv2.minMaxLoc(image)
-    step = 1.0 if dtype.kind == "u" else max((high - low) / 65535, 1e-15)
+    step = 1.0
+    if dtype.kind == "f":
+        # All but the wildest pixels, which a division by a bad flat field makes.
+        some = cv2.resize(image, (512, 512), interpolation=cv2.INTER_NEAREST)
+        low, high = np.percentile(some, (0.01, 99.99))
+        step = max(float(high - low) / 65535, 1e-15)
     return step / math.sqrt(12)
 
 
@@ -231,9 +229,9 @@ def _stretch_mesh(mesh: Image, shape: tuple[int, ...]) -> Image:
     return cv2.resize(mesh, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
 
 
-def _replace_defects(image: Image, base: float, noise: float) -> None:
+def _replace_defects(image: Image, noise: float) -> None:
     """Replace, in place, pixels that stand alone too sharply to be an image of a star."""
-    bright = cv2.findNonZero(cv2.compare(image, base + _DEFECT_SIGMAS * noise, cv2.CMP_GT))
+    bright = cv2.findNonZero(cv2.compare(image, _DEFECT_SIGMAS * noise, cv2.CMP_GT))
     if bright is None:
         return
     x, y = bright.reshape(-1, 2).T
@@ -244,7 +242,7 @@ def _replace_defects(image: Image, base: float, noise: float) -> None:
     steps = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0)]
     for step in steps:
         # One by one, since few are left after the first.
-        alone = beside(*step) - base < _DEFECT_RATIO * (image[y, x] - base)
+        alone = beside(*step) < _DEFECT_RATIO * image[y, x]
         y, x = y[alone], x[alone]
     image[y, x] = np.median([beside(*step) for step in steps], axis=0)
 

@@ -47,9 +47,8 @@ def annotate(
     )
     picture = cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR)
     flow = result.flow
-    if result.star_field is not None:
-        for row in np.flatnonzero(result.star_field.inliers):
-            _draw_vector(picture, flow.position[row], flow.displacement[row] * scale, zoom, _STAR)
+    for row in result.star_rows:
+        _draw_vector(picture, flow.position[row], flow.displacement[row] * scale, zoom, _STAR)
     for rso in result.detections:
         _draw_rso(picture, rso, result.dt_s * scale, zoom)
     _draw_caption(picture, result)

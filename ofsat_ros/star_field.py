@@ -117,7 +117,7 @@ def estimate_motion(
     Returns
     -------
     StarFieldMotion or None
-        None if there is no vector, or no two that agree where there are more than two.
+        None if there is no vector, or no two that agree where there are several.
     """
     if not len(position):
         return None
@@ -125,7 +125,7 @@ def estimate_motion(
     if model == "mean":
         return _mean_motion(displacement, speed, centre, outlier_sigmas)
     inliers = _mode(displacement, sigma)
-    if len(position) > 2 and np.count_nonzero(inliers) < 2:
+    if len(position) > 1 and np.count_nonzero(inliers) < 2:
         return None
     return _robust_fit(position - centre, displacement, sigma, speed, centre, inliers, model)
 

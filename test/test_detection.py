@@ -59,6 +59,7 @@ def frame(*xy, peak=100.0, noise=1.0):
     return FlowInput(
         smoothed=smoothed.astype(np.float32),
         mask=np.zeros(SHAPE, np.uint8),
+        pedestal=0.0,
         labels=np.zeros(SHAPE, np.int32),
         xy=none,
         sigma=none,

@@ -23,7 +23,7 @@ ENGINES = ("sparse", "dense")
 STILL = np.zeros((1, 2))
 
 
-def flow_input(smoothed, xy, noise=1.0, length=0.0, threshold=4.0):
+def flow_input(smoothed, xy, noise=1.0, length=0.0, threshold=4.0, pedestal=0.0):
     """What the earlier stages would give, built from what is known; labels by nearest object."""
     xy = np.reshape(xy, (-1, 2)).astype(float)
     mask = (smoothed > threshold * noise).astype(np.uint8)
@@ -36,6 +36,7 @@ def flow_input(smoothed, xy, noise=1.0, length=0.0, threshold=4.0):
     return FlowInput(
         smoothed=smoothed.astype(np.float32),
         mask=mask,
+        pedestal=pedestal,
         labels=labels,
         xy=xy,
         sigma=np.full_like(xy, 0.01),
@@ -109,8 +110,9 @@ def test_with_a_first_guess_any_motion_is_measured(engine, shift):
 @pytest.mark.parametrize(
     ("preset", "changes", "sees", "does_not_see"),
     [
-        # a star must lie within the window
-        ("robust", {"engine": "sparse"}, (2.0, 1.0), (9.0, 0.0)),
+        # a star must lie within the window, or within that of the third pyramid level
+        ("robust", {"engine": "sparse", "pyramid_levels": 0}, (2.0, 1.0), (9.0, 0.0)),
+        ("robust", {"engine": "sparse"}, (8.0, 3.0), (60.0, 0.0)),
         # two pyramid levels: four times the star's own width
         ("robust", {"engine": "dense"}, (3.0, 2.0), (14.0, 0.0)),
         # one derivative, no pyramid
@@ -490,3 +492,26 @@ def test_brightness_is_interpolated_and_continued_beyond_the_border():
     xy = np.array([[0, 0], [3, 2], [1.5, 1.0], [2.25, 0.5], [-5, 1], [1, 9]])
     assert frame.brightness_at(xy) == pytest.approx([0, 11, 5.5, 4.25, 4, 9])
     assert frame.brightness_at(np.zeros((0, 2))).shape == (0,)
+
+
+def test_published_filtered_image_holds_the_background():
+    image = np.zeros((32, 32))
+    image[10:13, 10:13] = 50
+    frame = flow_input(image, [(11, 11)], threshold=4.0, noise=1.0, pedestal=300.0)
+    filtered = frame.filtered
+    assert filtered[11, 11] == 350
+    assert np.count_nonzero(filtered) == 9
+
+
+def test_a_satellite_faster_than_the_window_is_found_with_the_pyramid():
+    """12 px a frame among fixed stars, with a window of 9 px and no guess near."""
+    stars = scattered(np.random.default_rng(4), SHAPE, 60)
+    rso, step = np.array([[150.0, 110.0]]), np.array([12.0, -3.0])
+    keep = np.hypot(*(stars - rso).T) > 40
+    before, now = np.vstack([stars[keep], rso - step]), np.vstack([stars[keep], rso])
+    inputs = [flow_input(blobs(SHAPE, xy, 1500.0, WIDTH), xy) for xy in (before, now)]
+    flow = measure(inputs)
+    assert flow.valid[-1]
+    # The pyramid ends at the full image: as sharp as any other.
+    np.testing.assert_allclose(flow.displacement[-1], step, atol=0.1)
+    assert not measure(inputs, pyramid_levels=0).valid[-1]

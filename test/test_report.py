@@ -45,6 +45,7 @@ def result(shape: tuple[int, int] = (HEIGHT, WIDTH), found: bool = True, **value
         rows["x"], rows["y"] = RSO
         rows["vx"], rows["vy"] = RSO_STEP / 0.5
         rows["snr"] = 25
+        rows["flow_index"] = 3
     position = np.vstack([STARS, RSO])
     displacement = np.vstack([np.tile(STEP, (len(STARS), 1)), RSO_STEP])
     valid, index = np.ones(4, bool), np.arange(4)

@@ -24,9 +24,11 @@ class FlowInput:
     Attributes
     ----------
     smoothed : (H, W) float32
-        Smoothed image, DN.
+        Smoothed image less its background, DN.
     mask : (H, W) uint8
         1 inside objects.
+    pedestal : float
+        What I_s as published holds of the background, DN.
     labels : (H, W) int32
         1 + index of the object at each pixel, 0 for none.
     xy : (N, 2) float64
@@ -41,11 +43,17 @@ class FlowInput:
 
     smoothed: Plane
     mask: NDArray[np.uint8]
+    pedestal: float
     labels: NDArray[np.int32]
     xy: Array
     sigma: Array
     length: Array
     noise: float
+
+    @property
+    def filtered(self) -> Plane:
+        """I_f as published, (H, W): I_s where it is above the threshold, elsewhere 0."""
+        return (self.smoothed + np.float32(self.pedestal)) * self.mask
 
     def brightness_at(self, xy: Array) -> Array:
         """Smoothed brightness between the pixels, DN: bilinear interpolation.

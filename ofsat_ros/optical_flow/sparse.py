@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +15,9 @@ from ofsat_ros.parameters import Parameters
 _STRETCH_LOW, _STRETCH_SPAN = 2.0, 200.0
 # OpenCV's own limit would drop stars of few grey levels; `brightness_kept` judges them better.
 _LEAST_EIGENVALUE = 1e-6
-# Lengths of streak, px, up to which a window is enlarged by that much; the first not at all.
-_STREAK_CLASSES_PX = (3, 6, 12, 24, 48, 96)
+# Streaks up to these lengths, px, and all longer ones, and how much longer their windows are.
+_STREAK_CLASSES_PX = (3, 6, 12, 24, 48)
+_WINDOW_GROWTH_PX = (0, 6, 12, 24, 48, 96)
 
 
 class SparseLucasKanade:
@@ -37,9 +40,7 @@ class SparseLucasKanade:
 
     def _to_8bit(self, frame: FlowInput) -> NDArray[np.uint8]:
         if self._parameters.stretch == "range":
-            # mask * smoothed is I_f
-            image = frame.smoothed * frame.mask
-            return cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U)
+            return cv2.normalize(frame.filtered, None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U)
         # From where noise ends to where a star needs no help: noise would pull vectors to zero.
         scaled = frame.smoothed / np.float32(frame.noise) - np.float32(_STRETCH_LOW)
         return cv2.convertScaleAbs(np.maximum(scaled, 0), alpha=255 / _STRETCH_SPAN)
@@ -51,6 +52,7 @@ class SparseLucasKanade:
         points: Array,
         guess: Array,
         window_px: int,
+        levels: int,
     ) -> tuple[Array, NDArray[np.bool_], Array]:
         """Follow points from `start` to `end`; return where they are, whether, and the error."""
         origin = points.astype(np.float32).reshape(-1, 1, 2)
@@ -61,7 +63,7 @@ class SparseLucasKanade:
             origin,
             target,
             winSize=(window_px | 1, window_px | 1),
-            maxLevel=self._parameters.pyramid_levels,
+            maxLevel=levels,
             criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.003),
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
             minEigThreshold=_LEAST_EIGENVALUE,
@@ -70,25 +72,6 @@ class SparseLucasKanade:
         ok = status.ravel() == 1
         # OpenCV leaves the error of a lost point undefined.
         return xy, ok, np.where(ok, error.ravel(), np.inf)
-
-    def _follow_streaks(
-        self, start: NDArray[np.uint8], end: NDArray[np.uint8], frame: FlowInput, guess: Array
-    ) -> tuple[Array, NDArray[np.bool_], Array]:
-        """`_follow` each object in a window as much larger as its streak is long.
-
-        A window inside a streak sees no motion along it; one much larger than the object sees the
-        neighbours' motion.
-        """
-        xy, ok = np.zeros_like(frame.xy), np.zeros(len(frame.xy), bool)
-        error = np.full(len(frame.xy), np.inf)
-        size = np.searchsorted(_STREAK_CLASSES_PX, frame.length)
-        for c in np.unique(size):
-            rows = size == c
-            extra = 0 if c == 0 else _STREAK_CLASSES_PX[min(c, len(_STREAK_CLASSES_PX) - 1)]
-            xy[rows], ok[rows], error[rows] = self._follow(
-                start, end, frame.xy[rows], guess, self._parameters.window_px + extra
-            )
-        return xy, ok, error
 
     def _measure_corners(
         self,
@@ -104,7 +87,7 @@ class SparseLucasKanade:
         if corners is None:
             return Flow.empty()
         points = corners.reshape(-1, 2).astype(np.float64)
-        position, ok, _ = self._follow(before, now, points, guess, p.window_px)
+        position, ok, _ = self._follow(before, now, points, guess, p.window_px, p.pyramid_levels)
         ok &= current.contains(position)
         position = np.where(ok[:, None], position, points)
         index = current.object_at(position)
@@ -120,18 +103,49 @@ class SparseLucasKanade:
         current: FlowInput,
         guesses: Array,
     ) -> Flow:
-        if not len(current.xy):
-            return Flow.empty()
-        runs = [self._follow_streaks(now, before, current, -guess) for guess in guesses]
-        starts = np.stack([run[0] for run in runs])
-        kept = np.stack(
-            [run[1] & brightness_kept(previous, current, run[0], current.xy) for run in runs]
+        count = len(current.xy)
+        start, valid = current.xy.copy(), np.zeros(count, bool)
+        # The pyramid reaches further, but blends an object with its neighbours: it is for those
+        # that are not found where a guess says.
+        for levels in (0, self._parameters.pyramid_levels):
+            for rows, window_px in self._by_streak(np.flatnonzero(~valid), current.length):
+                start[rows], valid[rows] = self._trace_back(
+                    before, now, previous, current, rows, guesses, window_px, levels
+                )
+        displacement = np.where(valid[:, None], current.xy - start, 0.0)
+        return Flow.of_vectors(
+            current.xy, displacement, current.displacement_sigma(), valid, np.arange(count)
         )
-        # A start at which the brightness is not kept is the wrong one, however small its error.
+
+    def _by_streak(
+        self, rows: NDArray[np.intp], length: Array
+    ) -> Iterator[tuple[NDArray[np.intp], int]]:
+        """Yield groups of objects and the side of their window, longer by their streaks' length.
+
+        A window inside a streak sees no motion along it; one much larger than the object sees the
+        neighbours' motion.
+        """
+        largest = len(_WINDOW_GROWTH_PX) - 1
+        size = np.minimum(np.searchsorted(_STREAK_CLASSES_PX, length[rows]), largest)
+        for c in np.unique(size):
+            yield rows[size == c], self._parameters.window_px + _WINDOW_GROWTH_PX[c]
+
+    def _trace_back(
+        self,
+        before: NDArray[np.uint8],
+        now: NDArray[np.uint8],
+        previous: FlowInput,
+        current: FlowInput,
+        rows: NDArray[np.intp],
+        guesses: Array,
+        window_px: int,
+        levels: int,
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Where objects were in the previous frame by the best of the guesses, and whether."""
+        xy = current.xy[rows]
+        runs = [self._follow(now, before, xy, -guess, window_px, levels) for guess in guesses]
+        kept = [ok & brightness_kept(previous, current, place, xy) for place, ok, _ in runs]
+        # A place at which the brightness is not kept is the wrong one, however small its error.
         error = np.stack([run[2] for run in runs]) + np.where(kept, 0, 1e6)
-        best = np.argmin(error, axis=0), np.arange(len(current.xy))
-        valid = kept[best]
-        displacement = np.where(valid[:, None], current.xy - starts[best], 0.0)
-        index = np.arange(len(current.xy))
-        sigma = current.displacement_sigma()
-        return Flow.of_vectors(current.xy, displacement, sigma, valid, index)
+        best = np.argmin(error, axis=0), np.arange(len(rows))
+        return np.stack([run[0] for run in runs])[best], np.stack(kept)[best]
