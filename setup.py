@@ -33,6 +33,7 @@ TEST = [
     "setuptools>=70.1,<80",  # the range in which colcon and pip can both build with it
 ]
 
+SAMPLE_BAG = "bags/survey_png"  # the smallest
 NODES = ("detector", "player", "simulator", "recorder", "demo")
 
 setup(
@@ -49,6 +50,8 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py"))),
+        # What the demo plays where there is no source tree.
+        (f"share/{NAME}/{SAMPLE_BAG}", sorted(glob(f"{SAMPLE_BAG}/*"))),
         # For people to copy from; the code reads the package's own, which pip installs too.
         (f"share/{NAME}/config", sorted(glob(f"{NAME}/presets/*.yaml") + glob(f"{NAME}/data/*"))),
     ],

@@ -7,34 +7,45 @@ For example::
 
 from pathlib import Path
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
+
+
+def simulator(context: LaunchContext) -> list[Node]:
+    """Return the simulator, which publishes where the detector listens."""
+    scenario, seed, rate, namespace, image = (
+        LaunchConfiguration(name).perform(context)
+        for name in ("scenario", "seed", "rate", "namespace", "image")
+    )
+    return [
+        Node(
+            package="ofsat_ros",
+            executable="simulator",
+            name="simulator",
+            namespace=namespace,
+            output="screen",
+            parameters=[{"scenario": scenario, "seed": int(seed), "rate": float(rate)}],
+            remappings=[("image", image)] if image else [],
+        )
+    ]
 
 
 def generate_launch_description() -> LaunchDescription:
     """Describe what `ros2 launch` starts; the detector's own arguments are taken too."""
-    simulator = Node(
-        package="ofsat_ros",
-        executable="simulator",
-        name="simulator",
-        output="screen",
-        parameters=[
-            {
-                "scenario": LaunchConfiguration("scenario"),
-                "seed": ParameterValue(LaunchConfiguration("seed"), value_type=int),
-                "rate": ParameterValue(LaunchConfiguration("rate"), value_type=float),
-            }
-        ],
-    )
     return LaunchDescription(
         [
             DeclareLaunchArgument("scenario", default_value="sidereal", description="sky to show"),
             DeclareLaunchArgument("seed", default_value="1", description="of the sky, its noise"),
             DeclareLaunchArgument("rate", default_value="1.0", description="1: in real time"),
+            DeclareLaunchArgument(
+                "namespace", default_value="", description="before the names of nodes and topics"
+            ),
+            DeclareLaunchArgument(
+                "image", default_value="", description="topic of the images; empty: image"
+            ),
             IncludeLaunchDescription(Path(__file__).with_name("detector.launch.py").as_posix()),
-            simulator,
+            OpaqueFunction(function=simulator),
         ]
     )

@@ -371,11 +371,26 @@ class DetectorParameters(Table):
         False,
         "detector",
         "true: reliable subscription, every frame is processed, for replay; false: sensor data,"
-        " the newest frame wins, for a live camera",
+        " the newest frame wins once backlog_s is used up, for a live camera",
         live=False,
     )
     queue_depth: int = _number(
-        10, 1, 1000, "frames", "detector", "depth of the reliable subscription", live=False
+        10,
+        1,
+        1000,
+        "frames",
+        "detector",
+        "depth of the reliable subscription; more frames wait in memory, up to 1 GiB",
+        live=False,
+    )
+    backlog_s: float = _number(
+        0.5,
+        0.0,
+        60.0,
+        "s",
+        "detector",
+        "live camera: frames may wait so long, and then all but the newest are dropped",
+        live=False,
     )
     marker_scale: float = _number(
         5.0, 0.1, 1000.0, "", "detector", "length of a drawn flow vector, in frames of motion"

@@ -1,6 +1,7 @@
 """A ROS graph for one test: a context, the nodes under test, and a probe that talks to them."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -128,6 +129,31 @@ class Process:
     @property
     def err(self) -> str:
         return self._err.read_text()
+
+    @property
+    def shared_memory(self) -> set[str]:
+        """Names of the segments that it has mapped, its own and those of whom it talks to."""
+        maps = Path(f"/proc/{self.popen.pid}/maps").read_text()
+        # Ports are shared by all, and outlive them.
+        return set(re.findall(r"/dev/shm/(fastrtps_(?!port)\w+)", maps))
+
+    def end(self, number: int, patience_s: float = PATIENCE_S) -> float:
+        """Send a signal, twice as an impatient user does; return the CPU time until its end, s."""
+        before_s = self._cpu_s()
+        self.popen.send_signal(number)
+        self.popen.send_signal(number)
+        deadline_s = time.monotonic() + patience_s
+        # It stays known to the system, with its times, until `wait` asks for the exit code.
+        ended = os.WEXITED | os.WNOWAIT | os.WNOHANG
+        while os.waitid(os.P_PID, self.popen.pid, ended) is None:
+            assert time.monotonic() < deadline_s, f"still there {patience_s:g} s after the signal"
+            time.sleep(0.02)
+        return self._cpu_s() - before_s
+
+    def _cpu_s(self) -> float:
+        fields = Path(f"/proc/{self.popen.pid}/stat").read_text().rpartition(")")[2].split()
+        user, system = fields[11:13]
+        return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
 
     def wait(self, patience_s: float = PATIENCE_S) -> int:
         """Return the exit code."""

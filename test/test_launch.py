@@ -133,10 +133,20 @@ def test_simulation_starts_simulator_and_detector(launch: Any):
     node = only("Node", asked)
     assert node.kwargs["executable"] == "simulator"
     (parameters,) = node.kwargs["parameters"]
-    defaults = {one.name: one.kwargs["default_value"] for one in of_kind("Argument", asked)}
     table = SimulatorParameters()
-    assert defaults == {name: f"{getattr(table, name)}" for name in parameters}
+    assert parameters == {name: getattr(table, name) for name in parameters}
+    assert node.kwargs["remappings"] == []
     assert Path(only("IncludeLaunchDescription", asked).name).name == "detector.launch.py"
+
+
+def test_simulator_publishes_where_the_detector_listens(launch: Any):
+    given = {"namespace": "east", "image": "/cam"}
+    simulator = only("Node", launch("simulation.launch.py", scenario="geo", seed="7", **given))
+    detector = only("Node", launch("detector.launch.py", **given))
+    assert simulator.kwargs["parameters"] == [{"scenario": "geo", "seed": 7, "rate": 1.0}]
+    assert simulator.kwargs["namespace"] == detector.kwargs["namespace"] == "east"
+    assert simulator.kwargs["remappings"] == [("image", "/cam")]
+    assert ("image", "/cam") in detector.kwargs["remappings"]
 
 
 @pytest.mark.parametrize("compressed", [False, True])

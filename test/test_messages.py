@@ -15,6 +15,7 @@ from ofsat_ros.images import EncodingError, encode_png
 from ofsat_ros.nodes import messages
 from ofsat_ros.optical_flow import Flow
 from ofsat_ros.pipeline import FrameResult
+from ofsat_ros.star_field import StarFieldMotion
 
 HEADER = Header(stamp=messages.time_message(1_700_000_000_123_456_789), frame_id="optical")
 
@@ -32,6 +33,22 @@ def detections(count: int = 3, seed: int = 0) -> np.ndarray:
 def result(rows: np.ndarray, flow: Flow | None = None) -> FrameResult:
     about = {"dt_s": 0.5, "detections": rows, "flow": flow or Flow.empty()}
     return FrameResult(stamp_ns=0, frame=1, shape=(100, 100), **about)
+
+
+def field(inliers: list[bool]) -> StarFieldMotion:
+    return StarFieldMotion(
+        centre=np.zeros(2),
+        displacement=np.zeros(2),
+        rotation=0.0,
+        scale=0.0,
+        covariance=np.eye(4),
+        inliers=np.array(inliers),
+        residual_px=0.1,
+        residual_sigmas=1.0,
+        speed_mean=0.0,
+        speed_std=0.0,
+        model="shift",
+    )
 
 
 def flow(count: int) -> Flow:
@@ -58,6 +75,13 @@ def test_stamp_is_read_from_serialized_messages():
 def test_stamp_is_read_in_either_byte_order():
     big = bytes([0, 0, 0, 0]) + (7).to_bytes(4, "big") + (9).to_bytes(4, "big")
     assert messages.header_stamp_ns(big) == 7_000_000_009
+
+
+@pytest.mark.parametrize("length", [0, 1, 11])
+def test_a_message_that_ends_before_its_stamp_is_refused(length):
+    data = serialize_message(Image(header=HEADER))[:length]
+    with pytest.raises(messages.MessageError, match=f"{length} bytes, too few"):
+        messages.header_stamp_ns(data)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
@@ -138,6 +162,48 @@ def test_detections_come_back_from_a_cloud():
     back = messages.detections_array(messages.detections_cloud(HEADER, rows))
     for name in set(DETECTION_DTYPE.names) - {"significance", "object_index", "flow_index"}:
         np.testing.assert_array_equal(back[name], rows[name])
+    assert np.isnan(back["significance"]).all()  # what is not carried is unknown, not 0
+    assert (back["object_index"] == -1).all()
+    assert (back["flow_index"] == -1).all()
+
+
+def test_a_cloud_of_something_else_says_what_it_lacks():
+    cloud = messages.detections_cloud(HEADER, detections(2))
+    cloud.fields = [f for f in cloud.fields if f.name not in ("snr", "u_rate")]
+    with pytest.raises(messages.MessageError, match="no field snr, u_rate"):
+        messages.detections_array(cloud)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda cloud: setattr(cloud, "width", 3),
+        lambda cloud: setattr(cloud, "point_step", 10),
+        lambda cloud: setattr(cloud.fields[0], "datatype", 99),
+        lambda cloud: setattr(cloud.fields[0], "name", cloud.fields[1].name),
+    ],
+    ids=["too few points", "overlapping points", "no such type", "a name twice"],
+)
+def test_a_cloud_that_contradicts_itself_is_refused(change):
+    cloud = messages.detections_cloud(HEADER, detections(2))
+    # Of its own: those of messages made here are shared.
+    cloud = deserialize_message(serialize_message(cloud), PointCloud2)
+    change(cloud)
+    with pytest.raises(messages.MessageError, match="contradicts itself"):
+        messages.detections_array(cloud)
+
+
+def test_pictures_come_back_and_others_are_refused():
+    pixels = np.random.default_rng(1).integers(0, 255, (4, 5, 3), np.uint8)
+    picture = messages.image_message(HEADER, pixels)
+    np.testing.assert_array_equal(messages.picture_array(picture), pixels)
+    padded = messages.image_message(HEADER, pixels)
+    padded.step += 1
+    cut = messages.image_message(HEADER, pixels)
+    cut.data = cut.data[:-1]
+    for other in (padded, cut, messages.image_message(HEADER, pixels[..., 0]), Image()):
+        with pytest.raises(messages.MessageError, match="not bgr8 without padding"):
+            messages.picture_array(other)
 
 
 def test_empty_cloud_is_whole():
@@ -146,12 +212,16 @@ def test_empty_cloud_is_whole():
     assert len(messages.cloud_array(cloud)) == 0
 
 
-def test_stars_are_the_valid_vectors_that_are_no_detection():
+def test_stars_are_what_moves_with_the_field_and_is_no_detection():
     vectors = flow(6)
-    vectors.valid[1] = False
     rows = detections(2)
     rows["flow_index"] = [4, -1]
-    array = messages.flow_markers(HEADER, result(rows, vectors), scale=3.0)
+    found = result(rows, vectors)
+    without_field = messages.flow_markers(HEADER, found, scale=3.0)
+    assert "star_flow" not in {m.ns for m in without_field.markers}
+
+    found.star_field = field([True, False, True, True, True, True])
+    array = messages.flow_markers(HEADER, found, scale=3.0)
     (stars,) = [m for m in array.markers if m.ns == "star_flow"]
     assert stars.type == Marker.LINE_LIST
     assert stars.color.b > stars.color.r

@@ -17,6 +17,7 @@ from ofsat_ros import report
 from ofsat_ros.images import encode_png
 from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.detector import Detector
+from ofsat_ros.nodes.health import Health
 from ofsat_ros.parameters import Parameters
 from ofsat_ros.pipeline import Pipeline
 
@@ -377,6 +378,43 @@ def test_no_image_is_said_and_forgotten_when_one_comes():
         assert status.level == DiagnosticStatus.WARN
         graph.probe.destroy_publisher(station.camera)
         station.diagnostics_when(lambda s: "nobody publishes it" in s.message)
+
+
+def test_diagnostics_that_fail_do_not_end_the_node(monkeypatch):
+    failed = []
+
+    def broken(self):
+        failed.append(True)
+        raise RuntimeError("deque mutated during iteration")
+
+    monkeypatch.setattr(Health, "values", broken)
+    frames = sky(2)
+    with Graph(*RELIABLE) as graph:
+        station = Station(graph)
+        station.send(image(frames[0]))
+        graph.until(lambda: failed)
+        station.send(image(frames[1]))
+    assert stamps(station.clouds) == [f.stamp_ns for f in frames]
+
+
+def test_markers_are_cleared_once_when_images_stop():
+    frames = sky(3)
+    with Graph(*RELIABLE, "-p", "no_image_timeout_s:=1.0") as graph:
+        station = Station(graph)
+        arrays = graph.listen(MarkerArray, "flow_markers")
+        graph.connect(*station.outputs("flow_markers"))
+        station.send(*map(image, frames))
+        last = header(frames[-1])
+
+        def of_last() -> list[int]:
+            return [len(a.markers) for a in arrays if a.markers[0].header == last]
+
+        graph.until(lambda: len(of_last()) == 2)
+        graph.serve(2.2)  # two more seconds of diagnostics
+    drawn, cleared = of_last()
+    assert drawn > 1
+    assert cleared == 1
+    assert arrays[-1].markers[0].action == Marker.DELETEALL
 
 
 def test_incompatible_qos_is_said_with_the_remedy():

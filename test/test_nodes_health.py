@@ -1,5 +1,8 @@
 """What the detector says of its own state."""
 
+import sys
+import threading
+
 import pytest
 
 from ofsat_ros.nodes.health import Health
@@ -111,3 +114,27 @@ def test_disabled_is_no_silence(clock):
     one.enabled = False
     clock[0] += 60
     assert problems(one) == ["disabled by ~/enable: images are ignored"]
+
+
+def test_it_may_be_read_while_frames_are_answered():
+    one = health()
+    result = FrameResult(0, 0, (10, 10))
+    ended = threading.Event()
+
+    def answer() -> None:
+        while not ended.is_set():
+            one.processed(result, latency_s=0.1)
+
+    worker = threading.Thread(target=answer)
+    usual_s = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)  # s; the threads take turns all the time
+    worker.start()
+    try:
+        # Without a lock about one in five raises: the frames change while the rate is computed.
+        for _ in range(3000):
+            assert one.values()["frames_processed"] >= 0
+            one.problems(publishers=1, timeout_s=5.0)
+    finally:
+        ended.set()
+        worker.join()
+        sys.setswitchinterval(usual_s)

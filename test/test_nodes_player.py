@@ -2,6 +2,7 @@
 
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -134,6 +135,59 @@ def test_replay_waits_for_the_answers_of_a_detector(bag, stop):
             graph.until(lambda wanted=wanted: len(heard) == wanted)
         graph.until(stop.is_set)
     assert stamps(heard) == TIMES
+
+
+def test_a_slow_detector_is_waited_for_while_it_answers(bag, stop, monkeypatch):
+    now = [1000.0]
+    monkeypatch.setattr("ofsat_ros.nodes.player.time", SimpleNamespace(monotonic=lambda: now[0]))
+    with Graph("-p", "rate:=0") as graph:
+        answers = graph.publisher(PointCloud2, "rso_detections")
+        heard = graph.listen(Image, "/camera/image")
+        player = graph.add(Player(stop, f"{bag}", context=graph.context))
+        graph.connect(answers)
+        graph.until(lambda: len(heard) == 4)
+        for answered in range(1, len(FRAMES)):
+            now[0] += 20  # s for a frame; several are waited for
+            graph.serve(0.05)
+            assert not stop.is_set(), f"gave up before answer {answered}"
+            to = heard[answered - 1].header
+            answers.publish(messages.cloud_message(to, messages.cloud_rows(0)))
+            wanted = min(answered + 4, len(FRAMES))
+            graph.until(lambda wanted=wanted: len(heard) == wanted)
+            graph.until(lambda: player._answered_s == now[0])
+        graph.serve(0.05)
+        assert not stop.is_set()
+        now[0] += 31  # the last answer never comes
+        graph.until(stop.is_set)
+    assert stamps(heard) == TIMES
+
+
+def test_a_truncated_message_is_skipped_and_said_once(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        for frame in FRAMES[:4]:
+            writer.write_image("/image", frame.image, frame.stamp_ns, "left")
+            cut = b"\0\1\0\0\1\2"
+            writer.write("/image", "sensor_msgs/msg/Image", cut, frame.stamp_ns + 1)
+    arguments = (f"{tmp_path / 'bag'}", "--ros-args", "-p", "rate:=0")
+    with Process(tmp_path, "player", *arguments) as player, Graph() as graph:
+        heard = graph.listen(Image, "/image")
+        graph.until(lambda: len(heard) == 4)
+        assert player.wait() == 0
+    assert stamps(heard) == TIMES[:4]
+    assert player.err.count("is skipped: it has 6 bytes") == 1
+    assert "played 4 frames" in player.err
+    assert "4 truncated ones skipped" in player.err
+
+
+def test_an_error_while_playing_is_no_success(bag, stop, monkeypatch):
+    def broken(self, *given):
+        raise OverflowError("of whatever")
+
+    monkeypatch.setattr(Player, "_publish", broken)
+    with Graph("-p", "wait_for_subscribers:=0") as graph:
+        player = graph.add(Player(stop, f"{bag}", context=graph.context))
+        graph.until(stop.is_set)
+        assert player.exit_code == 1
 
 
 def test_starting_beyond_the_end_is_an_error(bag, tmp_path):

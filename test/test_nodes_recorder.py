@@ -2,7 +2,10 @@
 
 import csv
 import re
+import resource
 import signal
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -13,11 +16,11 @@ import pytest
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.serialization import deserialize_message
 from ros_graph import Graph, Process, header, sky, write_bag
-from sensor_msgs.msg import Image, PointCloud2
+from sensor_msgs.msg import Image, PointCloud2, PointField
 from visualization_msgs.msg import MarkerArray
 
 from ofsat_ros.detection import CONFIRMED
-from ofsat_ros.nodes import messages
+from ofsat_ros.nodes import demo, messages
 from ofsat_ros.nodes.recorder import HEARING, Recorder
 from ofsat_ros.nodes.runtime import StartError
 from ofsat_ros.recordings import Bag
@@ -167,13 +170,89 @@ def test_table_and_files_are_whole_after_a_signal(tmp_path):
         assert bag.topics["/rso_detections"].count == 5
 
 
+def test_what_is_not_a_detectors_is_left_out(tmp_path):
+    folder = tmp_path / "output"
+    arguments = ("-p", f"output:={folder}", "-p", "picture_every:=1", "-p", "frames:=2")
+    first, second = results(0), results(1)
+    early = header(FRAMES[0])
+    early.stamp.sec = -5
+    field = PointField(name="x", datatype=PointField.FLOAT32, count=1)
+    foreign = [
+        ("rso_detections", PointCloud2(fields=[field], point_step=4, width=2, data=bytes(8))),
+        ("rso_detections", messages.cloud_message(early, messages.cloud_rows(1))),
+        ("star_field_motion", messages.star_field_vector(early, None)),
+        ("flow_markers", MarkerArray()),
+        ("image_annotated", messages.image_message(header(FRAMES[0]), FRAMES[0].image)),
+        ("image_annotated", Image(header=header(FRAMES[0]), encoding="bgr8", width=9, height=9)),
+    ]
+    kinds = {topic: type(message) for topic, message in first.items()}
+    stop = threading.Event()
+    with Graph(*arguments) as graph:
+        recorder = graph.add(Recorder(stop, context=graph.context))
+        publishers = {topic: graph.publisher(kind, topic) for topic, kind in kinds.items()}
+        graph.connect(*publishers.values())
+        publishers["rso_detections"].publish(first["rso_detections"])
+        for topic, message in [*foreign, *second.items()]:
+            publishers[topic].publish(message)
+            graph.serve_once()
+        graph.until(stop.is_set)
+        recorder.close()
+        assert recorder.exit_code == 0
+    assert [int(row["frame"]) for row in rows_of(folder)] == [1, 1]
+    assert [p.name for p in folder.glob("*.png")] == ["frame_000001.png"]
+    with Bag(folder / "results") as bag:
+        counts = {name: about.count for name, about in bag.topics.items()}
+    assert counts == {"/rso_detections": 2, "/star_field_motion": 1, "/flow_markers": 1}
+
+
+def test_pictures_that_come_at_once_are_all_kept(tmp_path):
+    count = 12  # while one is written, others come; a detector's publisher keeps as many
+    folder = tmp_path / "output"
+    frames = sky(count)
+    with Graph("-p", f"output:={folder}", "-p", "picture_every:=1") as graph:
+        graph.add(Recorder(threading.Event(), context=graph.context))
+        clouds = graph.publisher(PointCloud2, "rso_detections")
+        pictures = graph.publisher(Image, "image_annotated")
+        graph.connect(clouds, pictures)
+        for frame in frames:
+            clouds.publish(messages.cloud_message(header(frame), messages.cloud_rows(0)))
+        picture = np.zeros((600, 800, 3), np.uint8)
+        for frame in frames:
+            pictures.publish(messages.image_message(header(frame), picture))
+        graph.until(lambda: len(list(folder.glob("*.png"))) == count)
+
+
+def test_a_full_disk_is_one_clear_line(tmp_path):
+    folder = tmp_path / "output"
+    with (
+        Process(tmp_path, "recorder", "--ros-args", "-p", f"output:={folder}") as recorder,
+        Graph() as graph,
+    ):
+        clouds = graph.publisher(PointCloud2, "rso_detections")
+        graph.connect(clouds)
+        clouds.publish(results(1)["rso_detections"])
+        recorder.wait_for("time (UTC)")
+        # Files that may not grow fail as on a full disk.
+        limit = 16_384
+        resource.prlimit(recorder.popen.pid, resource.RLIMIT_FSIZE, (limit, limit))
+        for frame in FRAMES:
+            rows = messages.cloud_rows(1000)
+            clouds.publish(messages.cloud_message(header(frame), rows))
+        assert recorder.wait() == 1
+    said = [line for line in recorder.err.splitlines() if "[INFO]" not in line]
+    assert len(said) == 1, recorder.err
+    assert said[0].startswith(f"recorder: the recording in {folder} ends: ")
+    assert "File too large" in said[0]
+    assert len(rows_of(folder)) >= 2  # what was written stays
+
+
 def test_demo_from_start_to_end(tmp_path):
     frames = sky(12)
     bag, output = write_bag(tmp_path / "bag", frames), tmp_path / "demo_output"
     given = ("--bag", f"{bag}", "--output", f"{output}", "--rate", "0")
-    with Process(tmp_path, "demo", *given) as demo:
-        assert demo.wait(60) == 0, demo.err
-    said = re.search(r"12 frames played, 12 answered, (\d+) RSO detections", demo.out)
+    with Process(tmp_path, "demo", *given) as shown:
+        assert shown.wait(60) == 0, shown.err
+    said = re.search(r"12 frames played, 12 answered, (\d+) RSO detections", shown.out)
     found = rows_of(output)
     assert len(found) == int(said[1]) >= 5
     assert {int(row["stamp_ns"]) for row in found} <= {f.stamp_ns for f in frames}
@@ -196,17 +275,34 @@ def test_demo_from_start_to_end(tmp_path):
 def test_demo_leaves_no_process_behind(tmp_path):
     bag = write_bag(tmp_path / "bag", sky(12))
     given = ("--bag", f"{bag}", "--output", f"{tmp_path / 'output'}", "--rate", "0.1")
-    with Process(tmp_path, "demo", *given) as demo:
-        demo.wait_for("time (UTC)")
-        children = Path(f"/proc/{demo.popen.pid}/task/{demo.popen.pid}/children").read_text()
+    with Process(tmp_path, "demo", *given) as shown:
+        shown.wait_for("time (UTC)")
+        children = Path(f"/proc/{shown.popen.pid}/task/{shown.popen.pid}/children").read_text()
         assert len(children.split()) == 3
-        demo.popen.send_signal(signal.SIGINT)
-        assert demo.wait() == 130
+        shown.popen.send_signal(signal.SIGINT)
+        assert shown.wait() == 130
     assert not [pid for pid in children.split() if Path(f"/proc/{pid}").exists()]
-    assert "Traceback" not in demo.err
+    assert "Traceback" not in shown.err
+
+
+def test_ctrl_c_while_a_process_starts_leaves_none_behind(monkeypatch):
+    started = []
+    popen = subprocess.Popen
+
+    def interrupted(command: list[str], **options) -> subprocess.Popen:
+        process = popen([sys.executable, "-c", "import time; time.sleep(60)"], **options)
+        started.append(process)
+        signal.raise_signal(signal.SIGINT)
+        return process
+
+    monkeypatch.setattr(subprocess, "Popen", interrupted)
+    with pytest.raises(KeyboardInterrupt), demo._children() as start:
+        start("player")
+    (process,) = started
+    assert process.returncode is not None
 
 
 def test_demo_without_a_bag_says_so(tmp_path):
-    with Process(tmp_path, "demo", "--bag", f"{tmp_path / 'nothing'}") as demo:
-        assert demo.wait() == 2
-    assert "nothing does not exist" in demo.err
+    with Process(tmp_path, "demo", "--bag", f"{tmp_path / 'nothing'}") as shown:
+        assert shown.wait() == 2
+    assert "nothing does not exist" in shown.err

@@ -134,3 +134,15 @@ def test_without_loop_it_ends_with_the_scenario(monkeypatch):
     assert 1 <= len(heard) <= 3
     gaps = np.diff(stamps(heard))
     assert (gaps == 1_000_000_000).all()  # on the scenario's clock, whatever the rate
+
+
+def test_an_error_while_rendering_is_no_success(monkeypatch):
+    def broken(self):
+        raise OverflowError("of whatever")
+
+    monkeypatch.setattr(Simulator, "_render", broken)
+    stop = threading.Event()
+    with Graph() as graph:
+        simulator = graph.add(Simulator(stop, context=graph.context))
+        graph.until(stop.is_set)
+        assert simulator.exit_code == 1

@@ -3,6 +3,7 @@
 import ast
 import importlib.metadata
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -34,6 +35,7 @@ ROSDEP_KEYS = {
 }
 PIP_NAMES = {"yaml": "PyYAML"}
 DEADLINE_S = 30.0
+SAMPLE_BAG = "bags/survey_png"
 
 
 def run(*command: str | Path, cwd: Path) -> str:
@@ -61,7 +63,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a copy of the package, since a build leaves files beside what it builds."""
     folder = tmp_path_factory.mktemp("source") / "ofsat_ros"
     folder.mkdir()
-    for name in ("ofsat_ros", "launch", "resource"):
+    for name in ("ofsat_ros", "launch", "resource", SAMPLE_BAG):
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("setup.py", "setup.cfg", "pyproject.toml", "package.xml", "LICENSE"):
         shutil.copy(ROOT / name, folder)
@@ -108,6 +110,7 @@ def test_colcon_installs_share(installed: Path):
         **{f"launch/{file.name}": file for file in (ROOT / "launch").glob("*.launch.py")},
         **{f"config/{file.name}": file for file in (ROOT / "ofsat_ros/presets").glob("*.yaml")},
         **{f"config/{file.name}": file for file in (ROOT / "ofsat_ros/data").iterdir()},
+        **{f"{SAMPLE_BAG}/{file.name}": file for file in (ROOT / SAMPLE_BAG).iterdir()},
     }
     assert {"launch/detector.launch.py", "config/fastdds_large_images.xml"} <= set(expected)
     for name, original in expected.items():
@@ -175,6 +178,37 @@ def test_installed_detector_runs_until_interrupted(detector: subprocess.Popen):
     assert "Traceback" not in output
 
 
+def test_installed_demo_plays_the_installed_bag(installed: Path, tmp_path: Path):
+    demo = subprocess.Popen(
+        [*sourced(installed), installed / "lib/ofsat_ros/demo"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    try:
+        first = demo.stdout.readline()
+        demo.send_signal(signal.SIGINT)
+        rest, _ = demo.communicate(timeout=DEADLINE_S)  # ends when its children have, too
+    finally:
+        demo.kill()
+        demo.stdout.close()
+        demo.wait()
+    assert first.startswith("demo: "), first + rest
+    bag = Path(first.rpartition(" in ")[2].strip())
+    # With symlinks the build folder, from which Python runs, has it as well.
+    assert bag.is_relative_to(installed.parents[1])
+    assert bag.match(SAMPLE_BAG)
+    assert demo.returncode == 130, rest
+
+
+def test_pip_installs_the_sample_bag_too(metadata: importlib.metadata.Distribution):
+    installed = {path.as_posix().rpartition("share/")[2] for path in metadata.files}
+    for file in (ROOT / SAMPLE_BAG).iterdir():
+        assert f"ofsat_ros/{SAMPLE_BAG}/{file.name}" in installed
+
+
 def test_pip_installs_the_same_commands(metadata: importlib.metadata.Distribution):
     commands = {entry.name: entry.value for entry in metadata.entry_points}
     assert commands == {
@@ -223,3 +257,16 @@ def test_package_xml_names_what_is_imported():
 
     needed |= {element.text for element in package.findall("test_depend")}
     assert {ROSDEP_KEYS.get(name, name) for name in imported_packages("test")} <= needed
+
+
+def test_contributing_names_files_that_exist():
+    table = [
+        line.split("|")[1]
+        for line in (ROOT / "CONTRIBUTING.md").read_text().splitlines()
+        if line.startswith("| `")
+    ]
+    named = {name.rstrip("/") for cell in table for name in re.findall(r"`(.+?)`", cell)}
+    missing = [name for name in sorted(named) if not (ROOT / "ofsat_ros" / name).exists()]
+    assert not missing
+    parts = {path.name for path in (ROOT / "ofsat_ros").iterdir()}
+    assert named == parts - {"__init__.py", "__pycache__"}

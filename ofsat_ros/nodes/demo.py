@@ -82,10 +82,10 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _sample_bag() -> Path:
-    """Return the first sample bag of the source tree or of the installed share folder."""
+    """Return the first sample bag of the source tree, or else of an installed share folder."""
     package = Path(ofsat_ros.__file__).parent
-    prefixes = os.environ.get("AMENT_PREFIX_PATH", sys.prefix).split(os.pathsep)
-    folders = [package.parent, *(Path(p, "share", "ofsat_ros") for p in prefixes)]
+    prefixes = [*os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]
+    folders = [package.parent, *(Path(p, "share", "ofsat_ros") for p in prefixes if p)]
     for folder in folders:
         bags = sorted(path.parent for path in folder.glob("bags/*/metadata.yaml"))
         if bags:
@@ -116,20 +116,37 @@ def _children() -> Iterator:
     def start(node: str, *ros_arguments: str) -> subprocess.Popen:
         output = subprocess.PIPE if node == "recorder" else None
         command = [sys.executable, "-m", f"ofsat_ros.nodes.{node}", "--ros-args", *ros_arguments]
-        # An own session: Ctrl-C reaches this process, which then ends them in order.
-        process = subprocess.Popen(
-            command, stdout=output, text=True, env=environment, start_new_session=True
-        )
-        running.append(process)
+        with _signals_held_back():
+            # An own session: Ctrl-C reaches this process, which then ends them in order.
+            process = subprocess.Popen(
+                command, stdout=output, text=True, env=environment, start_new_session=True
+            )
+            running.append(process)
         return process
 
     try:
         yield start
     finally:
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-        for process in reversed(running):
-            _end(process)
-        signal.signal(signal.SIGINT, before)
+        with _signals_held_back():
+            for process in reversed(running):
+                _end(process)
+
+
+@contextmanager
+def _signals_held_back() -> Iterator[None]:
+    """Let SIGINT and SIGTERM wait: a process that starts just now must be known, to be ended."""
+    came: list[int] = []
+    before = {
+        number: signal.signal(number, lambda *_: came.append(1))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    if came:
+        raise KeyboardInterrupt
 
 
 def _end(process: subprocess.Popen) -> None:

@@ -8,7 +8,6 @@ is.  Topics, fields and units: README.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import threading
 import time
@@ -36,6 +35,7 @@ from ofsat_ros.nodes.ros_parameters import NodeParameters, start_value
 from ofsat_ros.nodes.runtime import (
     Inbox,
     overridable_qos,
+    parser_of,
     profile_path,
     reliable,
     run,
@@ -47,7 +47,7 @@ from ofsat_ros.pipeline import FrameResult, ImageError, Pipeline
 _LIVE_DEPTH = 5
 # Results are small; a subscriber may be this far behind and lose none.
 _RESULTS_DEPTH = 100
-_PICTURES_DEPTH = 5
+_PICTURES_DEPTH = 20
 _WARN_EVERY_S = 10.0
 
 
@@ -80,17 +80,20 @@ class Detector(Node):
         self._image_publishers = 0
         self._health = Health(self._images.topic_name, own.reliable_input, profile_path())
         self._said_silence = False
+        self._drawn: tuple[Header, float] | None = None  # markers that are to be seen, since when
+        self._closed = False
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/enable", self._on_enable)
         # Steady: diagnostics go on when a player's clock stands still.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(1.0, self._publish_diagnostics, clock=steady)
+        self.create_timer(1.0, self._tick, clock=steady)
         self._worker = threading.Thread(target=self._work, name="detector", daemon=True)
         self._worker.start()
         self.get_logger().info(f"waiting for images on {self._images.topic_name}")
 
     def close(self) -> None:
         """End the worker; a frame in work may still be answered."""
+        self._closed = True
         self._inbox.close()
         self._worker.join(0.5)
 
@@ -159,7 +162,7 @@ class Detector(Node):
                 self._answer(message, received_s)
             # Nothing that is drawn or sent may end the thread, and with it all answers.
             except Exception:  # noqa: BLE001
-                if not self.context.ok():
+                if self._closed:
                     return
                 self.get_logger().error(traceback.format_exc())
 
@@ -192,6 +195,7 @@ class Detector(Node):
         self._detections.publish(messages.detections_cloud(header, none))
         self._motion.publish(messages.star_field_vector(header, None))
         self._markers.publish(messages.no_flow_markers(header))
+        self._drawn = None
 
     def _publish(
         self, header: Header, image: np.ndarray, result: FrameResult, scale: float
@@ -200,9 +204,30 @@ class Detector(Node):
         self._motion.publish(messages.star_field_vector(header, result))
         if self._markers.get_subscription_count():
             self._markers.publish(messages.flow_markers(header, result, scale))
+            self._drawn = (header, time.monotonic())
         if self._annotated.get_subscription_count():
             picture = report.annotate(image, result, scale=scale)
             self._annotated.publish(messages.image_message(header, picture))
+
+    def _tick(self) -> None:
+        """Do once a second what does not depend on images."""
+        try:
+            self._clear_stale_markers()
+            self._publish_diagnostics()
+        # To say how it is must not end what works.
+        except Exception:  # noqa: BLE001
+            self.get_logger().error(traceback.format_exc(), throttle_duration_sec=_WARN_EVERY_S)
+
+    def _clear_stale_markers(self) -> None:
+        """Delete what is drawn when images stop: viewers would show it for ever."""
+        timeout_s = self._settings[DetectorParameters].no_image_timeout_s
+        goes_on = self._health.enabled and self._health.silence_s() <= timeout_s
+        drawn = self._drawn
+        # A slow frame is answered long after its image has come: its markers stay as long, too.
+        if drawn is None or goes_on or time.monotonic() - drawn[1] <= timeout_s:
+            return
+        self._drawn = None
+        self._markers.publish(messages.no_flow_markers(drawn[0]))
 
     def _publish_diagnostics(self) -> None:
         self._image_publishers = self.count_publishers(self._images.topic_name)
@@ -230,12 +255,10 @@ class Detector(Node):
 
 def main() -> int:
     """Run the node; return the exit code."""
-    parser = argparse.ArgumentParser(
-        "detector",
-        description="Detect satellites in a camera's images.",
-        epilog="Parameters: --ros-args -p NAME:=VALUE; the README has a table of them.",
+    return run(
+        lambda stop, options: Detector(),
+        parser_of("detector", "Detect satellites in a camera's images."),
     )
-    return run(lambda stop, options: Detector(), parser)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,12 @@
 """What the detector knows of its own state: counts, rates, and what is wrong in words.
 
 The detector tells it what happens; ``/diagnostics`` shows what it makes of it.  It imports no ROS.
+Frames are answered in one thread, and everything else happens in another.
 """
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import deque
 from typing import Any
@@ -31,6 +33,7 @@ class Health:
     """
 
     def __init__(self, topic: str, reliable: bool, profile: str) -> None:
+        self._lock = threading.Lock()  # for what both threads touch
         self._topic = topic
         self._reliable = reliable
         self._profile = profile
@@ -66,16 +69,18 @@ class Health:
 
     def processed(self, result: FrameResult, latency_s: float) -> None:
         """Take note of a frame's result and of the time from its receipt to its answer."""
-        self._counts["processed"] += 1
-        self._processed_at.append(time.monotonic())
-        self._latency_s = latency_s
-        self._result = result
-        self._failure = ""
+        with self._lock:
+            self._counts["processed"] += 1
+            self._processed_at.append(time.monotonic())
+            self._latency_s = latency_s
+            self._result = result
+            self._failure = ""
 
     def failed(self, why: str) -> None:
         """Take note of a frame that could not be processed."""
-        self._counts["failed"] += 1
-        self._failure = why
+        with self._lock:
+            self._counts["failed"] += 1
+            self._failure = why
 
     def incompatible_qos(self, policy: str) -> str:
         """Take note of a publisher that cannot be heard; return what to say about it."""
@@ -123,13 +128,15 @@ class Health:
         """Return what is wrong now, in words; empty if nothing is."""
         drops = time.monotonic() - self._last_drop_s <= _RECENT_S
         silent = self.enabled and self.silence_s() > timeout_s
+        with self._lock:
+            failure = self._failure
         found = [
             "" if self.enabled else "disabled by ~/enable: images are ignored",
             self.silence(publishers) if silent else "",
             self._incompatible if not self._counts["received"] else "",
             self.losses(),
             f"slower than the camera: {self._counts['dropped']} frames dropped" if drops else "",
-            f"the last frame could not be processed: {self._failure}" if self._failure else "",
+            f"the last frame could not be processed: {failure}" if failure else "",
             "images bear no stamp, without which there is no velocity: have the driver set"
             " header.stamp"
             if self._zero_stamp
@@ -139,15 +146,19 @@ class Health:
 
     def summary(self) -> str:
         """Return the state in words when nothing is wrong."""
-        if self._result is None:
+        with self._lock:
+            result = self._result
+        if result is None:
             return "waiting for images"
-        return self._result.reason or f"{len(self._result.detections)} RSOs"
+        return result.reason or f"{len(result.detections)} RSOs"
 
     def values(self) -> dict[str, Any]:
         """Return names and values for ``/diagnostics``."""
-        values: dict[str, Any] = {f"frames_{key}": count for key, count in self._counts.items()}
-        values |= {"rate_hz": self._rate_hz(), "latency_s": self._latency_s}
-        result = self._result
+        values: dict[str, Any] = {}
+        with self._lock:
+            values |= {f"frames_{key}": count for key, count in self._counts.items()}
+            values |= {"rate_hz": self._rate_hz(), "latency_s": self._latency_s}
+            result = self._result
         if result is None:
             return values
         field = result.star_field

@@ -7,6 +7,7 @@ the header it is given, so that a result bears its image's stamp and frame.
 from __future__ import annotations
 
 import array
+import math
 import struct
 import sys
 from collections.abc import Mapping
@@ -25,6 +26,7 @@ from ofsat_ros.images import decode_compressed, decode_image
 from ofsat_ros.pipeline import FrameResult
 
 _NS = 1_000_000_000
+_STAMP_BYTES = 8
 
 # Where the first header lies in a serialized message: after CDR's own header, and in an array
 # after its length.
@@ -80,6 +82,10 @@ _LINE_WIDTH_PX = 1.0
 _TEXT_HEIGHT_PX = 12.0
 
 
+class MessageError(ValueError):
+    """A message that is not what its topic is for; the text says why."""
+
+
 def stamp_ns(stamp: Time) -> int:
     """Return a message's time in ns."""
     return stamp.sec * _NS + stamp.nanosec
@@ -91,7 +97,15 @@ def time_message(ns: int) -> Time:
 
 
 def header_stamp_ns(data: bytes | memoryview, header_at: int = HEADER_AT) -> int:
-    """Return the stamp of a serialized message whose header lies at an offset, ns."""
+    """Return the stamp of a serialized message whose header lies at an offset, ns.
+
+    Raises
+    ------
+    MessageError
+        If the message ends before.
+    """
+    if len(data) < header_at + _STAMP_BYTES:
+        raise MessageError(f"it has {len(data)} bytes, too few for a stamp")
     # The second byte tells the byte order of what follows.
     sec, nanosec = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, header_at)
     return sec * _NS + nanosec
@@ -184,27 +198,60 @@ def detections_cloud(header: Header, detections: np.ndarray) -> PointCloud2:
 def detections_array(cloud: PointCloud2) -> np.ndarray:
     """Return the detections of an ``rso_detections`` message as DETECTION_DTYPE.
 
-    Columns that the message does not carry are 0.
+    Columns that the message does not carry are NaN, rows of other arrays are -1.
+
+    Raises
+    ------
+    MessageError
+        If the message is no such cloud.
     """
     points = cloud_array(cloud)
+    if missing := _DETECTION_FIELDS.keys() - set(points.dtype.names or ()):
+        raise MessageError(f"the cloud has no field {', '.join(sorted(missing))}")
     rows = np.zeros(len(points), DETECTION_DTYPE)
+    rows["significance"] = np.nan
+    rows["object_index"] = rows["flow_index"] = -1
     for field, column in _DETECTION_FIELDS.items():
         rows[column] = points[field]
     return rows
 
 
 def cloud_array(cloud: PointCloud2) -> np.ndarray:
-    """Return the points of any cloud as a structured array, one field per field."""
+    """Return the points of any cloud as a structured array, one field per field.
+
+    Raises
+    ------
+    MessageError
+        If its fields, steps and data contradict each other.
+    """
     order = ">" if cloud.is_bigendian else "<"
-    dtype = np.dtype(
-        {
-            "names": [field.name for field in cloud.fields],
-            "formats": [order + _DTYPES[field.datatype] for field in cloud.fields],
-            "offsets": [field.offset for field in cloud.fields],
-            "itemsize": cloud.point_step,
-        }
-    )
-    return np.frombuffer(cloud.data, dtype, cloud.width * cloud.height)
+    try:
+        dtype = np.dtype(
+            {
+                "names": [field.name for field in cloud.fields],
+                "formats": [order + _DTYPES[field.datatype] for field in cloud.fields],
+                "offsets": [field.offset for field in cloud.fields],
+                "itemsize": cloud.point_step,
+            }
+        )
+        return np.frombuffer(cloud.data, dtype, cloud.width * cloud.height)
+    except (KeyError, ValueError) as error:
+        raise MessageError(f"the cloud contradicts itself: {error}") from error
+
+
+def picture_array(message: Image) -> np.ndarray:
+    """Return an annotated picture, shape (height, width, 3), uint8, as `image_message` sends it.
+
+    Raises
+    ------
+    MessageError
+        If it is another kind of image.
+    """
+    shape = (message.height, message.width, 3)
+    whole = message.step == 3 * message.width and len(message.data) == math.prod(shape)
+    if message.encoding != "bgr8" or not whole or not message.data:
+        raise MessageError(f"the picture is not bgr8 without padding but {message.encoding!r}")
+    return np.frombuffer(message.data, np.uint8).reshape(shape)
 
 
 def no_flow_markers(header: Header) -> MarkerArray:
@@ -227,7 +274,7 @@ def flow_markers(header: Header, result: FrameResult, scale: float) -> MarkerArr
         Length of a vector, in frames of motion.
     """
     array_ = no_flow_markers(header)
-    stars = _star_flow(result)
+    stars = result.star_rows
     start, step = result.flow.position[stars], result.flow.displacement[stars]
     array_.markers += _vectors(header, "star_flow", _BLUE, start, step * scale)
     rows = result.detections
@@ -276,16 +323,6 @@ def _bytes_array(pixels: np.ndarray) -> array.array:
     if pixels.size:
         data.frombytes(memoryview(np.ascontiguousarray(pixels).reshape(-1).view(np.uint8)))
     return data
-
-
-def _star_flow(result: FrameResult) -> np.ndarray:
-    """Rows of the flow that are the star field's: the fit's inliers, or all valid ones."""
-    stars = result.flow.valid.copy()
-    if result.star_field is not None:
-        stars &= result.star_field.inliers
-    flagged = result.detections["flow_index"]
-    stars[flagged[flagged >= 0]] = False
-    return stars
 
 
 def _marker(header: Header, namespace: str, number: int, kind: int, color: ColorRGBA) -> Marker:

@@ -8,7 +8,7 @@ are on their way to it: replay then slows down instead of losing frames.
 
 from __future__ import annotations
 
-import argparse
+import math
 import sys
 import threading
 import time
@@ -24,7 +24,14 @@ from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 
 from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.ros_parameters import NodeParameters
-from ofsat_ros.nodes.runtime import MIDDLEWARE_ERRORS, StartError, overridable_qos, reliable, run
+from ofsat_ros.nodes.runtime import (
+    StartError,
+    lifetime,
+    overridable_qos,
+    parser_of,
+    reliable,
+    run,
+)
 from ofsat_ros.parameters import PlayerParameters
 from ofsat_ros.recordings import Bag, RecordingError
 
@@ -89,6 +96,8 @@ class Player(Node):
             PointCloud2, "rso_detections", self._on_answer, reliable(100)
         )
         self._nobody_answers = False
+        self._answered_s = -math.inf
+        self._truncated = 0
         self._thread = threading.Thread(target=self._run, name="player", daemon=True)
         self._thread.start()
 
@@ -109,6 +118,7 @@ class Player(Node):
         stamp = messages.stamp_ns(cloud.header.stamp)
         with self._answered:
             self._nobody_answers = False
+            self._answered_s = time.monotonic()
             if stamp in self._unanswered:
                 # An answer stands for what a live detector has skipped before it, too.
                 while self._unanswered.popleft() != stamp:
@@ -116,22 +126,17 @@ class Player(Node):
             self._answered.notify_all()
 
     def _run(self) -> None:
-        try:
+        with lifetime(self, self._stop):
             self._wait_for_subscribers()
-            again = True
-            while again and not self._stop.is_set():
-                self._play()
-                again = self._settings[PlayerParameters].loop
+            try:
+                again = True
+                while again and not self._stop.is_set():
+                    self._play()
+                    again = self._settings[PlayerParameters].loop
+            except RecordingError as error:
+                self.get_logger().error(str(error))
+                self.exit_code = 1
             self._finish()
-        except RecordingError as error:
-            self.get_logger().error(str(error))
-            self.exit_code = 1
-            self._finish()
-        except MIDDLEWARE_ERRORS:
-            if self.context.ok():
-                raise
-        finally:
-            self._stop.set()
 
     def _wait_for_subscribers(self) -> None:
         wanted = self._settings[PlayerParameters].wait_for_subscribers
@@ -164,11 +169,11 @@ class Player(Node):
             self._wait_for_answers(_UNANSWERED - 1)
             if self._stop.is_set():
                 break
-            self._publish(topic, time_ns, data)
-            count += 1
+            count += self._publish(topic, time_ns, data)
             if count % _DEPTH == 0:
                 self._wait_for_receipt()
-        self.get_logger().info(f"played {count} frames of {self._bag.path}")
+        skipped = f"; {self._truncated} truncated ones skipped" if self._truncated else ""
+        self.get_logger().info(f"played {count} frames of {self._bag.path}{skipped}")
         if not count and not self._stop.is_set():
             raise RecordingError(
                 f"{self._bag.path} holds no image after start_s = {own.start_s:g} s"
@@ -189,11 +194,21 @@ class Player(Node):
             self._stop.wait(min(next_s - now_s, _CLOCK_PERIOD_S))
         return due_s
 
-    def _publish(self, topic: str, time_ns: int, data: bytes | memoryview) -> None:
+    def _publish(self, topic: str, time_ns: int, data: bytes | memoryview) -> bool:
+        """Publish an image; return False if it ends within its header, and so is none."""
         self._publish_clock(time_ns)
+        try:
+            stamp = messages.header_stamp_ns(data)
+        except messages.MessageError as error:
+            self._truncated += 1
+            self.get_logger().warning(
+                f"{topic}: a message at {time_ns} ns is skipped: {error}", once=True
+            )
+            return False
         with self._answered:
-            self._unanswered.append(messages.header_stamp_ns(data))
+            self._unanswered.append(stamp)
         self._publishers_of[topic].publish(bytes(data))
+        return True
 
     def _publish_clock(self, time_ns: int) -> None:
         self._clock_at_s = time.monotonic()
@@ -206,12 +221,13 @@ class Player(Node):
         Acknowledgements do not tell: the middleware gives them when a frame arrives, and
         overwrites frames that its reader has not taken.
         """
-        deadline_s = time.monotonic() + _ANSWER_PATIENCE_S
+        begun_s = time.monotonic()
         with self._answered:
             while len(self._unanswered) > at_most and not self._stop.is_set():
                 if self._nobody_answers or not self._is_answered():
                     self._unanswered.clear()
-                elif time.monotonic() > deadline_s:
+                # A slow detector answers seldom, but it answers: each answer buys time anew.
+                elif time.monotonic() > max(begun_s, self._answered_s) + _ANSWER_PATIENCE_S:
                     self._nobody_answers = True
                     self.get_logger().warning(
                         f"{self._answers.topic_name} answers no more: going on without"
@@ -264,11 +280,7 @@ def _image_topics(bag: Bag, wanted: str) -> list[str]:
 
 def main() -> int:
     """Run the node; return the exit code."""
-    parser = argparse.ArgumentParser(
-        "player",
-        description="Play the images of a bag.",
-        epilog="Parameters: --ros-args -p NAME:=VALUE; the README has a table of them.",
-    )
+    parser = parser_of("player", "Play the images of a bag.")
     parser.add_argument("bag", nargs="?", default="", help="a bag's folder, .mcap, .db3 or .bag")
     return run(lambda stop, options: Player(stop, options.bag), parser)
 

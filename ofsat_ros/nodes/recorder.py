@@ -6,12 +6,12 @@ Writes into a folder: ``detections.csv``, ``frame_*.png`` (every n-th annotated 
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -27,7 +27,7 @@ from visualization_msgs.msg import MarkerArray
 from ofsat_ros.images import encode_png
 from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.ros_parameters import NodeParameters
-from ofsat_ros.nodes.runtime import StartError, overridable_qos, reliable, run
+from ofsat_ros.nodes.runtime import StartError, overridable_qos, parser_of, reliable, run
 from ofsat_ros.parameters import RecorderParameters
 from ofsat_ros.recordings import BagWriter, RecordingError
 from ofsat_ros.results import DETECTION_COLUMNS, DETECTIONS, detection_lines
@@ -37,7 +37,9 @@ HEARING = "hearing a detector"  # printed as soon as this is so
 
 # Results that may wait while a picture is written.
 _DEPTH = 1000
-_PICTURES_DEPTH = 5
+# Pictures that come while one is written: none that is wanted may be lost.
+_PICTURES_DEPTH = 20
+_WARN_EVERY_S = 10.0
 # Consecutive frames without detection that share one line of the table.
 _QUIET_FRAMES = 10
 # What else belongs to the last frame comes a moment after its detections.
@@ -54,6 +56,11 @@ class Recorder(Node):
     context : Context, optional
         ROS context; default: the process's.
 
+    Attributes
+    ----------
+    exit_code : int
+        1 if the files could not be written to the end, else 0.
+
     Raises
     ------
     ofsat_ros.parameters.ParameterError
@@ -64,6 +71,7 @@ class Recorder(Node):
 
     def __init__(self, stop: threading.Event, context: Context | None = None) -> None:
         super().__init__("recorder", context=context)
+        self.exit_code = 0
         self._stop = stop
         self._own = NodeParameters(self, RecorderParameters())[RecorderParameters]
         self._folder = Path(self._own.output)
@@ -93,32 +101,58 @@ class Recorder(Node):
             if self._closed:
                 return
             self._closed = True
-            self._table.end()
-            self._csv.close()
-            self._bag.close()
+            for finish in (self._table.end, self._csv.close, self._bag.close):
+                try:
+                    finish()
+                except (OSError, RecordingError) as error:
+                    self._give_up(error)
+        if self.exit_code:
+            return
         _say(
             f"{self._frames} frames, {self._detections} RSO detections; {DETECTIONS},"
             f" {self._pictures} pictures and the bag {BAG} are in {self._folder}"
         )
 
     def _subscribe(self) -> None:
-        def subscribe(kind: type, topic: str, callback, depth: int, raw: bool) -> str:
-            qos, override = reliable(depth), overridable_qos()
+        def subscribe(
+            kind: type, topic: str, take: Callable[[bytes], None], depth: int = _DEPTH
+        ) -> str:
+            # Raw: the bag is to hold what was received, and few pictures are looked into.
             subscription = self.create_subscription(
-                kind, topic, callback, qos, raw=raw, qos_overriding_options=override
+                kind,
+                topic,
+                lambda data: self._take(topic, take, data),
+                reliable(depth),
+                raw=True,
+                qos_overriding_options=overridable_qos(),
             )
             return subscription.topic_name
 
-        # Raw: the bag is to hold what was received.
-        self._cloud_topic = subscribe(
-            PointCloud2, "rso_detections", self._on_detections, _DEPTH, True
-        )
-        self._motion_topic = subscribe(
-            Vector3Stamped, "star_field_motion", self._on_motion, _DEPTH, True
-        )
-        self._marker_topic = subscribe(MarkerArray, "flow_markers", self._on_markers, _DEPTH, True)
+        self._cloud_topic = subscribe(PointCloud2, "rso_detections", self._on_detections)
+        self._motion_topic = subscribe(Vector3Stamped, "star_field_motion", self._on_motion)
+        self._marker_topic = subscribe(MarkerArray, "flow_markers", self._on_markers)
         if self._own.picture_every:
-            subscribe(Image, "image_annotated", self._on_picture, _PICTURES_DEPTH, False)
+            subscribe(Image, "image_annotated", self._on_picture, _PICTURES_DEPTH)
+
+    def _take(self, topic: str, take: Callable[[bytes], None], data: bytes) -> None:
+        try:
+            if not self.exit_code:
+                take(data)
+        except (OSError, RecordingError) as error:
+            self._give_up(error)
+        # Whatever others publish under these names must not end the recording.
+        except Exception as error:  # noqa: BLE001
+            self.get_logger().warning(
+                f"a message on {topic} is left out, which is not a detector's: {error}",
+                throttle_duration_sec=_WARN_EVERY_S,
+            )
+
+    def _give_up(self, error: Exception) -> None:
+        """End, since a file cannot be written; say the first reason."""
+        if not self.exit_code:
+            self.exit_code = 1
+            sys.stderr.write(f"recorder: the recording in {self._folder} ends: {error}\n")
+        self._stop.set()
 
     def _on_detections(self, data: bytes) -> None:
         cloud = deserialize_message(data, PointCloud2)
@@ -146,12 +180,11 @@ class Recorder(Node):
             stamp = messages.header_stamp_ns(data, messages.FIRST_MARKER_AT)
             self._write(self._marker_topic, "visualization_msgs/msg/MarkerArray", data, stamp)
 
-    def _on_picture(self, image: Image) -> None:
-        frame = dict(self._recent).get(messages.stamp_ns(image.header.stamp))
+    def _on_picture(self, data: bytes) -> None:
+        frame = dict(self._recent).get(messages.header_stamp_ns(data))
         if frame is None or frame % self._own.picture_every:
             return
-        pixels = np.frombuffer(image.data, np.uint8).reshape(image.height, image.width, 3)
-        png = encode_png(pixels)
+        png = encode_png(messages.picture_array(deserialize_message(data, Image)))
         with self._lock:
             if not self._closed:
                 (self._folder / PICTURE.format(frame)).write_bytes(png)
@@ -159,6 +192,8 @@ class Recorder(Node):
 
     def _write(self, topic: str, msgtype: str, data: bytes, stamp: int) -> None:
         """Write into the bag, at the image's time: it then plays beside the recording."""
+        if stamp < 0:
+            raise messages.MessageError("its stamp is before 1970")
         if not self._closed:
             self._bag.write(topic, msgtype, data, stamp or time.time_ns())
 
@@ -235,12 +270,10 @@ def _say(line: str) -> None:
 
 def main() -> int:
     """Run the node; return the exit code."""
-    parser = argparse.ArgumentParser(
-        "recorder",
-        description="Print and record what a detector finds.",
-        epilog="Parameters: --ros-args -p NAME:=VALUE; the README has a table of them.",
+    return run(
+        lambda stop, options: Recorder(stop),
+        parser_of("recorder", "Print and record what a detector finds."),
     )
-    return run(lambda stop, options: Recorder(stop), parser)
 
 
 if __name__ == "__main__":

@@ -15,14 +15,15 @@ import platform
 import signal
 import sys
 import threading
+import traceback
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib import resources
 from typing import Any
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions, QoSPolicyKind
@@ -32,8 +33,6 @@ from rclpy.utilities import remove_ros_args
 from ofsat_ros.nodes.ros_parameters import refuse_unknown
 from ofsat_ros.parameters import ParameterError
 
-# What the middleware raises in a thread that still works while the node ends.
-MIDDLEWARE_ERRORS = (rclpy_implementation.RCLError, rclpy_implementation.InvalidHandle)
 STARTED_WRONGLY = 2  # exit code; the same as argparse's
 
 _PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
@@ -51,10 +50,12 @@ class Inbox:
     Parameters
     ----------
     depth : int
-        Messages that may always wait.
+        Messages that may wait whatever their size; more may wait while they are small.
     newest_only : bool
-        True: a new message replaces those that wait.  False: none is lost; `put` blocks when
-        `depth` messages and `LIMIT_BYTES` are reached, whichever is later.
+        True: a new message replaces those that wait, so that at most one does.  False: none is
+        lost; `put` blocks only when `depth` messages wait and one more would exceed
+        `LIMIT_BYTES`.  So up to 1 GiB is held whatever the depth, and more than that only for the
+        first `depth` messages.
     """
 
     # The middleware overwrites what is not taken from it in time, without a word; so memory, not
@@ -117,6 +118,37 @@ def reliable(depth: int) -> QoSProfile:
     return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE)
 
 
+@contextmanager
+def lifetime(node: Node, stop: threading.Event) -> Iterator[None]:
+    """Wrap all that a node's own thread does: with it the node ends, with 1 after an error.
+
+    Parameters
+    ----------
+    node : Node
+        Its attribute ``exit_code`` becomes 1 after an error, which is logged.
+    stop : threading.Event
+        Set at the end.  An error after it was set is none: the node is being taken apart.
+    """
+    try:
+        yield
+    # Otherwise the thread would end, and the node would seem to have done its work.
+    except Exception:  # noqa: BLE001
+        if not stop.is_set():
+            node.get_logger().error(traceback.format_exc())
+            node.exit_code = 1
+    finally:
+        stop.set()
+
+
+def parser_of(node: str, description: str) -> argparse.ArgumentParser:
+    """Return a parser for a node's arguments that are not ROS's; the node may add some."""
+    return argparse.ArgumentParser(
+        node,
+        description=description,
+        epilog="Parameters: --ros-args -p NAME:=VALUE; the README has a table of them.",
+    )
+
+
 def run(
     make_node: Callable[[threading.Event, argparse.Namespace], Node],
     parser: argparse.ArgumentParser,
@@ -129,7 +161,7 @@ def run(
         Called with the stop event, which the node may set, and the parsed arguments.  The node
         has a ``close()`` that ends its own threads and flushes its files within half a second.
     parser : argparse.ArgumentParser
-        For the arguments that are not ROS's.
+        As `parser_of` makes it.
 
     Returns
     -------

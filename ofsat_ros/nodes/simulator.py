@@ -6,7 +6,6 @@ own clock from the time of the start, so that displacement over time is the true
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 import threading
@@ -23,7 +22,7 @@ from std_msgs.msg import Header
 from ofsat_ros.detection import CONFIRMED
 from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.ros_parameters import NodeParameters
-from ofsat_ros.nodes.runtime import MIDDLEWARE_ERRORS, overridable_qos, reliable, run
+from ofsat_ros.nodes.runtime import lifetime, overridable_qos, parser_of, reliable, run
 from ofsat_ros.parameters import SimulatorParameters
 from ofsat_ros.simulation import SimulatedFrame, SkySimulator, scenario
 
@@ -43,6 +42,11 @@ class Simulator(Node):
     context : Context, optional
         ROS context; default: the process's.
 
+    Attributes
+    ----------
+    exit_code : int
+        1 if an error ended it, else 0.
+
     Raises
     ------
     ofsat_ros.parameters.ParameterError
@@ -51,6 +55,7 @@ class Simulator(Node):
 
     def __init__(self, stop: threading.Event, context: Context | None = None) -> None:
         super().__init__("simulator", context=context)
+        self.exit_code = 0
         self._stop = stop
         self._settings = NodeParameters(self, SimulatorParameters())
         own = self._settings[SimulatorParameters]
@@ -82,7 +87,7 @@ class Simulator(Node):
         )
         due_s = time.monotonic()
         number = 0
-        try:
+        with lifetime(self, self._stop):
             while number < settings.frames or own.loop:
                 header, frame, attitude = self._render()
                 self._stop.wait(max(0.0, due_s - time.monotonic()))
@@ -93,11 +98,6 @@ class Simulator(Node):
                 # A machine that cannot keep up renders late, not in bursts.
                 due_s = max(due_s, time.monotonic() - 1.0) + settings.period_s / own.rate
             self._images.wait_for_all_acked(Duration(seconds=10))
-        except MIDDLEWARE_ERRORS:
-            if self.context.ok():
-                raise
-        finally:
-            self._stop.set()
 
     def _render(self) -> tuple[Header, SimulatedFrame, np.ndarray]:
         """Expose a frame; with it the attitude in the middle of the exposure."""
@@ -192,12 +192,10 @@ def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def main() -> int:
     """Run the node; return the exit code."""
-    parser = argparse.ArgumentParser(
-        "simulator",
-        description="Simulate a telescope camera.",
-        epilog="Parameters: --ros-args -p NAME:=VALUE; the README has a table of them.",
+    return run(
+        lambda stop, options: Simulator(stop),
+        parser_of("simulator", "Simulate a telescope camera."),
     )
-    return run(lambda stop, options: Simulator(stop), parser)
 
 
 if __name__ == "__main__":

@@ -196,7 +196,9 @@ def _pick(word: str, known: dict[str, Any], what: str) -> Any:
 def _make_way(path: Path, force: bool) -> None:
     """Remove a bag, or say why not."""
     if not force:
-        raise RecordingError(f"{path} exists: choose another path, or force to replace a bag")
+        raise RecordingError(
+            f"{path} exists: choose another path, or --force (force=True) to replace it"
+        )
     bag = path.is_dir() and not path.is_symlink() and (path / "metadata.yaml").exists()
     inside = sorted(path.iterdir()) if bag else []
     foreign = [f.name for f in inside if not (f.name == "metadata.yaml" or _is_storage(f))]
