@@ -380,7 +380,7 @@ class DetectorParameters(Table):
         1000,
         "frames",
         "detector",
-        "depth of the reliable subscription; more frames wait in memory, up to 1 GiB",
+        "depth of the image subscription; more frames wait in memory, up to 1 GiB",
         live=False,
     )
     backlog_s: float = _number(

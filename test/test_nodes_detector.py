@@ -194,7 +194,7 @@ def test_live_input_drops_all_but_the_newest(monkeypatch):
         return process(self, image, stamp_ns)
 
     monkeypatch.setattr(Pipeline, "process", slow)
-    with Graph() as graph:
+    with Graph("-p", "backlog_s:=0.0") as graph:
         station = Station(graph)
         station.camera.publish(image(frames[0]))
         graph.until(entered.is_set)

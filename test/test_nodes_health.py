@@ -39,8 +39,15 @@ def test_silence_names_the_topic_and_what_to_do(clock):
     assert "no image on /camera/image for 6 s: nobody publishes it; remap" in nobody
     (somebody,) = problems(one, publishers=1)
     assert f"FASTRTPS_DEFAULT_PROFILES_FILE={PROFILE}" in somebody
+    (typo,) = one.problems(0, 5.0, ["/camera/image_raw"])
+    assert typo.endswith("images are on /camera/image_raw")
     one.image_received(1, has_stamp=True)
     assert problems(one) == []
+    clock[0] += 7
+    (ended,) = problems(one, publishers=1)
+    assert ended == (
+        "no image on /camera/image for 7 s: 1 came before; the sender has paused or ended"
+    )
 
 
 def test_lost_frames_are_counted_from_the_senders_numbers(clock):

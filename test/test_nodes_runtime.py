@@ -18,20 +18,41 @@ MEGABYTE = 1 << 20
 
 
 def test_inbox_keeps_the_order():
-    inbox = Inbox(depth=3, newest_only=False)
+    inbox = Inbox(depth=3, backlog_s=None)
     for number in range(3):
         assert inbox.put(number, MEGABYTE) == 0
     assert [inbox.get() for _ in range(3)] == [0, 1, 2]
 
 
-def test_live_inbox_keeps_the_newest_and_counts_the_others():
-    inbox = Inbox(depth=3, newest_only=True)
+def test_live_inbox_without_backlog_keeps_the_newest_and_counts_the_others():
+    inbox = Inbox(depth=3, backlog_s=0.0)
     assert [inbox.put(number, MEGABYTE) for number in range(3)] == [0, 1, 1]
     assert inbox.get() == 2
 
 
+def test_live_inbox_loses_nothing_in_a_hiccup_and_all_but_the_newest_in_an_overload(monkeypatch):
+    now_s = 100.0
+    monkeypatch.setattr(runtime.time, "monotonic", lambda: now_s)
+    inbox = Inbox(depth=3, backlog_s=0.5)
+    for number in range(10):  # 0.45 s
+        assert inbox.put(number, MEGABYTE) == 0
+        now_s += 0.05
+    assert inbox.get() == 0
+    assert inbox.put(10, MEGABYTE) == 0  # the oldest has waited for 0.45 s
+    now_s += 0.1
+    assert inbox.put(11, MEGABYTE) == 10
+    assert inbox.get() == 11
+
+
+def test_live_inbox_never_blocks():
+    inbox = Inbox(depth=1, backlog_s=60.0)
+    half = Inbox.LIMIT_BYTES // 2
+    assert [inbox.put(number, half) for number in range(4)] == [0, 0, 2, 0]
+    assert inbox.get() == 2
+
+
 def test_full_inbox_blocks_until_there_is_room():
-    inbox = Inbox(depth=2, newest_only=False)
+    inbox = Inbox(depth=2, backlog_s=None)
     half = Inbox.LIMIT_BYTES // 2
     inbox.put(0, half)
     inbox.put(1, half)
@@ -46,14 +67,14 @@ def test_full_inbox_blocks_until_there_is_room():
 
 
 def test_small_frames_may_queue_beyond_the_depth():
-    inbox = Inbox(depth=2, newest_only=False)
+    inbox = Inbox(depth=2, backlog_s=None)
     for number in range(100):  # would block, and never end, if the depth were the limit
         inbox.put(number, MEGABYTE)
     assert inbox.get() == 0
 
 
 def test_closing_releases_both_ends():
-    inbox = Inbox(depth=1, newest_only=False)
+    inbox = Inbox(depth=1, backlog_s=None)
     got: list = []
     thread = threading.Thread(target=lambda: got.append(inbox.get()))
     thread.start()

@@ -2,8 +2,8 @@
 
 Its callbacks only take messages in; one worker thread processes and publishes, so that every
 frame it takes is answered once, in order: by an empty cloud if it could not be processed.
-A live camera (best effort) is answered for its newest frame; with ``reliable_input`` every frame
-is.  Topics, fields and units: README.
+With ``reliable_input`` every frame of the sender is answered; a live camera's frames (best effort)
+may wait for ``backlog_s``, and then only the newest is.  Topics, fields and units: README.
 """
 
 from __future__ import annotations
@@ -43,8 +43,6 @@ from ofsat_ros.nodes.runtime import (
 from ofsat_ros.parameters import DEFAULT_PRESET, DetectorParameters, Parameters, Table
 from ofsat_ros.pipeline import FrameResult, ImageError, Pipeline
 
-# Frames of a live camera that the middleware holds while one is taken out; 1 drops the odd one.
-_LIVE_DEPTH = 5
 # Results are small; a subscriber may be this far behind and lose none.
 _RESULTS_DEPTH = 100
 _PICTURES_DEPTH = 20
@@ -74,7 +72,8 @@ class Detector(Node):
         own = self._settings[DetectorParameters]
         self._pipeline = Pipeline(self._settings[Parameters])
         self._reset_wanted = ""
-        self._inbox = Inbox(own.queue_depth, newest_only=not own.reliable_input)
+        backlog_s = None if own.reliable_input else own.backlog_s
+        self._inbox = Inbox(own.queue_depth, backlog_s)
         self._create_publishers()
         self._images = self._subscribe(own)
         self._image_publishers = 0
@@ -112,10 +111,8 @@ class Detector(Node):
 
     def _subscribe(self, own: DetectorParameters):
         compressed = own.image_transport == "compressed"
-        if own.reliable_input:
-            qos = reliable(own.queue_depth)
-        else:
-            qos = QoSProfile(depth=_LIVE_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        kind = ReliabilityPolicy.RELIABLE if own.reliable_input else ReliabilityPolicy.BEST_EFFORT
+        qos = QoSProfile(depth=own.queue_depth, reliability=kind)
         return self.create_subscription(
             CompressedImage if compressed else Image,
             "image/compressed" if compressed else "image",
@@ -232,10 +229,11 @@ class Detector(Node):
     def _publish_diagnostics(self) -> None:
         self._image_publishers = self.count_publishers(self._images.topic_name)
         timeout_s = self._settings[DetectorParameters].no_image_timeout_s
-        self._say_aloud(timeout_s)
+        elsewhere = [] if self._image_publishers else self._other_image_topics()
+        self._say_aloud(timeout_s, elsewhere)
         status = messages.diagnostic(
             f"{self.get_fully_qualified_name()}: detection",
-            self._health.problems(self._image_publishers, timeout_s),
+            self._health.problems(self._image_publishers, timeout_s, elsewhere),
             self._health.summary(),
             self._health.values(),
         )
@@ -243,11 +241,20 @@ class Detector(Node):
         array.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array)
 
-    def _say_aloud(self, timeout_s: float) -> None:
+    def _other_image_topics(self) -> list[str]:
+        """Topics with images that somebody else publishes: perhaps the camera's."""
+        kind = "sensor_msgs/msg/" + self._images.msg_type.__name__
+        return [
+            name
+            for name, kinds in self.get_topic_names_and_types()
+            if kind in kinds and name != self._annotated.topic_name and self.count_publishers(name)
+        ]
+
+    def _say_aloud(self, timeout_s: float, elsewhere: list[str]) -> None:
         """Log what a user must know who does not watch ``/diagnostics``."""
         silent = self._health.enabled and self._health.silence_s() > timeout_s
         if silent and not self._said_silence:
-            self.get_logger().warning(self._health.silence(self._image_publishers))
+            self.get_logger().warning(self._health.silence(self._image_publishers, elsewhere))
         self._said_silence = silent
         if losses := self._health.losses():
             self.get_logger().warning(losses, throttle_duration_sec=_WARN_EVERY_S)

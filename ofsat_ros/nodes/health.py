@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 from ofsat_ros.pipeline import FrameResult
@@ -101,13 +102,19 @@ class Health:
         """Return the time since the last image, or since the start, s."""
         return time.monotonic() - self._last_image_s
 
-    def silence(self, publishers: int) -> str:
-        """Return what to say when no image comes, with the remedy."""
-        if publishers == 0:
-            why = f"nobody publishes it; remap {_relative(self._topic)} to the camera's"
+    def silence(self, publishers: int, elsewhere: Sequence[str] = ()) -> str:
+        """Return what to say when no image comes, with the remedy.
+
+        `publishers` is how many publish the image topic, `elsewhere` other topics with images.
+        """
+        if self._counts["received"]:
+            why = f"{self._counts['received']} came before; the sender has paused or ended"
+        elif publishers == 0:
+            found = f"; images are on {', '.join(elsewhere)}" if elsewhere else ""
+            why = f"nobody publishes it; remap {_relative(self._topic)} to the camera's{found}"
         else:
             why = (
-                f"{publishers} publish it: paused, ended, of incompatible QoS, or its images do"
+                "somebody publishes it, but paused, or with an incompatible QoS, or its images do"
                 f" not fit its shared memory; {self._remedy_at_sender()}"
             )
         return f"no image on {self._topic} for {self.silence_s():.0f} s: {why}"
@@ -119,12 +126,14 @@ class Health:
         lost = self._counts["lost"]
         if self._reliable:
             return (
-                f"{lost} frames lost: they come faster than they are processed; slow the sender"
-                " down, or raise queue_depth"
+                f"at least {lost} frames lost: they come faster than they are processed; slow the"
+                " sender down, or raise queue_depth"
             )
-        return f"{lost} frames lost on the way: {self._remedy_at_sender()}"
+        return f"at least {lost} frames lost on the way: {self._remedy_at_sender()}"
 
-    def problems(self, publishers: int, timeout_s: float) -> list[str]:
+    def problems(
+        self, publishers: int, timeout_s: float, elsewhere: Sequence[str] = ()
+    ) -> list[str]:
         """Return what is wrong now, in words; empty if nothing is."""
         drops = time.monotonic() - self._last_drop_s <= _RECENT_S
         silent = self.enabled and self.silence_s() > timeout_s
@@ -132,7 +141,7 @@ class Health:
             failure = self._failure
         found = [
             "" if self.enabled else "disabled by ~/enable: images are ignored",
-            self.silence(publishers) if silent else "",
+            self.silence(publishers, elsewhere) if silent else "",
             self._incompatible if not self._counts["received"] else "",
             self.losses(),
             f"slower than the camera: {self._counts['dropped']} frames dropped" if drops else "",

@@ -236,8 +236,7 @@ class Player(Node):
                     self._answered.wait(_POLL_S)
 
     def _is_answered(self) -> bool:
-        answerers = self.count_publishers(self._answers.topic_name)
-        return answerers > 0 and self._any_subscriber(ReliabilityPolicy.RELIABLE)
+        return self.count_publishers(self._answers.topic_name) > 0
 
     def _wait_for_receipt(self) -> None:
         """Wait until every reliable subscriber has received all: nothing is overwritten."""

@@ -15,6 +15,7 @@ import platform
 import signal
 import sys
 import threading
+import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -51,21 +52,22 @@ class Inbox:
     ----------
     depth : int
         Messages that may wait whatever their size; more may wait while they are small.
-    newest_only : bool
-        True: a new message replaces those that wait, so that at most one does.  False: none is
-        lost; `put` blocks only when `depth` messages wait and one more would exceed
+    backlog_s : float or None
+        None: none is lost; `put` blocks only when `depth` messages wait and one more would exceed
         `LIMIT_BYTES`.  So up to 1 GiB is held whatever the depth, and more than that only for the
-        first `depth` messages.
+        first `depth` messages.  A number: when one has waited for longer, or there is no room,
+        the next replaces all that wait, so that a hiccup loses none and an overload is caught up
+        with at once.
     """
 
     # The middleware overwrites what is not taken from it in time, without a word; so memory, not
     # a count of frames, bounds how far a reliable sender may run ahead of the worker.
     LIMIT_BYTES = 1 << 30
 
-    def __init__(self, depth: int, newest_only: bool) -> None:
+    def __init__(self, depth: int, backlog_s: float | None) -> None:
         self._depth = depth
-        self._newest_only = newest_only
-        self._items: deque[tuple[Any, int]] = deque()
+        self._backlog_s = backlog_s
+        self._items: deque[tuple[Any, int, float]] = deque()  # message, size, when it came
         self._bytes = 0
         self._closed = False
         self._changed = threading.Condition()
@@ -74,13 +76,16 @@ class Inbox:
         """Add a message of `size` bytes; return how many waiting ones it replaced."""
         with self._changed:
             replaced = 0
-            if self._newest_only:
+            now_s = time.monotonic()
+            if self._backlog_s is None:
+                self._changed.wait_for(lambda: self._closed or self._has_room(size))
+            elif self._items and (
+                now_s - self._items[0][2] >= self._backlog_s or not self._has_room(size)
+            ):
                 replaced = len(self._items)
                 self._items.clear()
                 self._bytes = 0
-            else:
-                self._changed.wait_for(lambda: self._closed or self._has_room(size))
-            self._items.append((item, size))
+            self._items.append((item, size, now_s))
             self._bytes += size
             self._changed.notify_all()
             return replaced
@@ -91,7 +96,7 @@ class Inbox:
             self._changed.wait_for(lambda: self._closed or self._items)
             if self._closed:
                 return None
-            item, size = self._items.popleft()
+            item, size, _ = self._items.popleft()
             self._bytes -= size
             self._changed.notify_all()
             return item
