@@ -2,7 +2,7 @@
 
 For example::
 
-    ros2 launch ofsat_ros replay.launch.py bag:=night.mcap rate:=2.0 preset:=robust
+    ros2 launch ofsat_ros replay.launch.py bag:=night.mcap rate:=2.0 record:=night1
 """
 
 from pathlib import Path
@@ -25,8 +25,8 @@ from ofsat_ros.recordings import COMPRESSED_IMAGE, Bag, open_recording
 
 def replay(context: LaunchContext) -> list:
     """Return player and detector, joined at the image topic that the bag holds."""
-    bag, topic, rate = (
-        LaunchConfiguration(name).perform(context) for name in ("bag", "topic", "rate")
+    bag, topic, rate, record = (
+        LaunchConfiguration(name).perform(context) for name in ("bag", "topic", "rate", "record")
     )
     with open_recording(bag, topic or None) as recording:
         topic = recording.topic
@@ -53,7 +53,16 @@ def replay(context: LaunchContext) -> list:
     )
     # The player ends when the detector has answered the last frame.
     end = OnProcessExit(target_action=player, on_exit=[Shutdown(reason="the bag has ended")])
-    return [detector, player, RegisterEventHandler(end)]
+    # First the recorder: it is to hear the first result.
+    recorder = Node(
+        package="ofsat_ros",
+        executable="recorder",
+        name="recorder",
+        namespace=LaunchConfiguration("namespace"),
+        output="screen",
+        parameters=[{"output": ParameterValue(record, value_type=str)}],
+    )
+    return [*([recorder] if record else []), detector, player, RegisterEventHandler(end)]
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -66,6 +75,11 @@ def generate_launch_description() -> LaunchDescription:
             ),
             DeclareLaunchArgument(
                 "rate", default_value="1.0", description="1: as recorded; 0: as fast as possible"
+            ),
+            DeclareLaunchArgument(
+                "record",
+                default_value="",
+                description="folder for the results, which are printed too; empty: neither",
             ),
             DeclareLaunchArgument(
                 "namespace", default_value="", description="before the names of nodes and topics"

@@ -19,6 +19,7 @@ from ofsat_ros.parameters import (
     preset_names,
 )
 from ofsat_ros.recordings import BagWriter, RecordingError
+from ofsat_ros.simulation import SCENARIOS
 
 ROOT = Path(__file__).parents[1]
 
@@ -132,6 +133,13 @@ def test_simulation_starts_simulator_and_detector(launch: Any):
     asked = launch("simulation.launch.py")
     node = only("Node", asked)
     assert node.kwargs["executable"] == "simulator"
+    # It ends, and with it all, when the simulator cannot start.
+    assert (
+        only("OnProcessExit", [only("RegisterEventHandler", asked).name]).kwargs["target_action"]
+        is node
+    )
+    (scenario,) = (one for one in of_kind("Argument", asked) if one.name == "scenario")
+    assert scenario.kwargs["choices"] == list(SCENARIOS)
     (parameters,) = node.kwargs["parameters"]
     table = SimulatorParameters()
     assert parameters == {name: getattr(table, name) for name in parameters}
@@ -187,3 +195,15 @@ def test_replay_says_which_image_topics_there_are(launch: Any, tmp_path: Path):
             bag.write_image(topic, np.zeros((16, 16), np.uint8), 1, "cam")
     with pytest.raises(RecordingError, match=r"/east \(1\), /west \(1\)"):
         launch("replay.launch.py", bag=f"{tmp_path / 'bag'}")
+
+
+def test_replay_records_when_told_where(launch: Any, tmp_path: Path):
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.write_image("/cam/image_raw", np.zeros((16, 16), np.uint8), 1, "cam")
+    asked = launch("replay.launch.py", bag=f"{tmp_path / 'bag'}", record="20260401")
+    recorder, player = of_kind("Node", asked)
+    assert (recorder.kwargs["executable"], player.kwargs["executable"]) == ("recorder", "player")
+    (parameters,) = recorder.kwargs["parameters"]
+    output = parameters["output"]
+    assert (output.name, output.kwargs) == ("20260401", {"value_type": str})
+    assert recorder.kwargs["namespace"].name == player.kwargs["namespace"].name == "namespace"
