@@ -15,11 +15,12 @@ from launch.actions import (
     RegisterEventHandler,
     Shutdown,
 )
-from launch.event_handlers import OnProcessExit
+from launch.event_handlers import OnProcessExit, OnProcessIO
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
+from ofsat_ros.nodes.recorder import HEARING
 from ofsat_ros.recordings import COMPRESSED_IMAGE, Bag, open_recording
 
 
@@ -53,7 +54,8 @@ def replay(context: LaunchContext) -> list:
     )
     # The player ends when the detector has answered the last frame.
     end = OnProcessExit(target_action=player, on_exit=[Shutdown(reason="the bag has ended")])
-    # First the recorder: it is to hear the first result.
+    if not record:
+        return [detector, player, RegisterEventHandler(end)]
     recorder = Node(
         package="ofsat_ros",
         executable="recorder",
@@ -62,7 +64,12 @@ def replay(context: LaunchContext) -> list:
         output="screen",
         parameters=[{"output": ParameterValue(record, value_type=str)}],
     )
-    return [*([recorder] if record else []), detector, player, RegisterEventHandler(end)]
+    # Not before the recorder hears the detector: it is to have the first result, too.
+    start = OnProcessIO(
+        target_action=recorder,
+        on_stdout=lambda said: [player] if HEARING.encode() in said.text else None,
+    )
+    return [recorder, detector, RegisterEventHandler(start), RegisterEventHandler(end)]
 
 
 def generate_launch_description() -> LaunchDescription:

@@ -6,12 +6,13 @@ The wheels of ROS lack `launch`, so the files run with stand-ins that record wha
 import runpy
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from ofsat_ros.nodes.recorder import HEARING
 from ofsat_ros.parameters import (
     DetectorParameters,
     PlayerParameters,
@@ -201,8 +202,15 @@ def test_replay_records_when_told_where(launch: Any, tmp_path: Path):
     with BagWriter(tmp_path / "bag") as bag:
         bag.write_image("/cam/image_raw", np.zeros((16, 16), np.uint8), 1, "cam")
     asked = launch("replay.launch.py", bag=f"{tmp_path / 'bag'}", record="20260401")
-    recorder, player = of_kind("Node", asked)
-    assert (recorder.kwargs["executable"], player.kwargs["executable"]) == ("recorder", "player")
+    recorder = only("Node", asked)
+    assert recorder.kwargs["executable"] == "recorder"
+    # The player is to start as soon as the recorder hears the detector, and not before.
+    start = only("OnProcessIO", [one.name for one in of_kind("RegisterEventHandler", asked)])
+    assert start.kwargs["target_action"] is recorder
+    say = start.kwargs["on_stdout"]
+    assert say(SimpleNamespace(text=b"recording")) is None
+    (player,) = say(SimpleNamespace(text=f"{HEARING}\n".encode()))
+    assert player.kwargs["executable"] == "player"
     (parameters,) = recorder.kwargs["parameters"]
     output = parameters["output"]
     assert (output.name, output.kwargs) == ("20260401", {"value_type": str})
