@@ -445,7 +445,12 @@ class SimulatorParameters(Table):
 class RecorderParameters(Table):
     """What the recorder node reads."""
 
-    output: str = _plain("ofsat_results", "recorder", "folder to write", live=False)
+    output: str = _plain(
+        "", "recorder", "folder to write; empty: one named by the time, ofsat_...", live=False
+    )
+    overwrite: bool = _plain(
+        False, "recorder", "replace what a recorder has left in the folder", live=False
+    )
     picture_every: int = _number(
         10, 0, 100000, "frames", "recorder", "keep every n-th annotated picture; 0: none", False
     )

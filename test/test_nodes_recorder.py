@@ -130,9 +130,30 @@ def test_every_nth_picture_is_kept(recorded):
     assert (picture == (40, 0, 250)).all()
 
 
+def test_results_are_replaced_only_when_asked_for(recorded):
+    folder, _ = recorded
+    before = rows_of(folder)
+    with (
+        Graph("-p", f"output:={folder}") as graph,
+        pytest.raises(StartError, match=r"already holds results.*overwrite:=true"),
+    ):
+        Recorder(threading.Event(), context=graph.context)
+    assert before
+    assert rows_of(folder) == before
+
+
+def test_without_a_name_the_folder_is_named_by_the_time(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with Graph() as graph:
+        graph.add(Recorder(threading.Event(), context=graph.context))
+    (folder,) = tmp_path.iterdir()
+    assert re.fullmatch(r"ofsat_\d{8}_\d{6}", folder.name)
+    assert rows_of(folder) == []
+
+
 def test_a_folder_of_results_is_used_again_but_no_other(recorded, tmp_path):
     folder, _ = recorded
-    with Graph("-p", f"output:={folder}") as graph:
+    with Graph("-p", f"output:={folder}", "-p", "overwrite:=true") as graph:
         graph.add(Recorder(threading.Event(), context=graph.context))
         assert rows_of(folder) == []
         assert not list(folder.glob("*.png"))

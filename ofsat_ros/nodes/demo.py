@@ -65,7 +65,12 @@ def _run(options: argparse.Namespace) -> int:
     transport = "compressed" if compressed else "raw"
     print(f"demo: {count} frames of {topic} in {bag}")
     with _children() as start:
-        recorder = start("recorder", "-p", f"output:={options.output}", "-p", f"frames:={count}")
+        recorder = start(
+            "recorder",
+            *("-p", f"output:={options.output}"),
+            *("-p", "overwrite:=true"),
+            *("-p", f"frames:={count}"),
+        )
         lines = _Echo(recorder)
         detector = start(
             "detector",

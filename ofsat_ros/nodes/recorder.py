@@ -74,9 +74,10 @@ class Recorder(Node):
         self.exit_code = 0
         self._stop = stop
         self._own = NodeParameters(self, RecorderParameters())[RecorderParameters]
-        self._folder = Path(self._own.output)
+        named_by_time = datetime.now(UTC).strftime("ofsat_%Y%m%d_%H%M%S")
+        self._folder = Path(self._own.output or named_by_time)
         try:
-            _claim(self._folder)
+            _claim(self._folder, self._own.overwrite)
             self._bag = BagWriter(self._folder / BAG, force=True)
             self._csv = open(self._folder / DETECTIONS, "w", encoding="utf-8")  # noqa: SIM115
             self._csv.write(",".join(DETECTION_COLUMNS) + "\n")
@@ -249,8 +250,8 @@ class _Table:
             self._quiet.clear()
 
 
-def _claim(folder: Path) -> None:
-    """Make the folder, or remove the files that a recorder has left there; else raise."""
+def _claim(folder: Path, overwrite: bool) -> None:
+    """Make the folder, or remove the files that a recorder has left there, if so wanted."""
     folder.mkdir(parents=True, exist_ok=True)
     ours = [folder / DETECTIONS, *folder.glob(PICTURE.replace("{:06d}", "[0-9]*"))]
     foreign = sorted(p.name for p in folder.iterdir() if p not in [*ours, folder / BAG])
@@ -258,6 +259,11 @@ def _claim(folder: Path) -> None:
         raise StartError(
             f"{folder} holds {', '.join(foreign[:3])}, which is not a recorder's: choose another"
             " folder with -p output:=FOLDER"
+        )
+    if not overwrite and any(folder.iterdir()):
+        raise StartError(
+            f"{folder} already holds results: choose another folder with -p output:=FOLDER, or"
+            " replace them with -p overwrite:=true"
         )
     for path in ours:
         path.unlink(missing_ok=True)
