@@ -59,6 +59,36 @@ _ENCODINGS = {
 }
 
 
+def decode_message(message: Any) -> np.ndarray:
+    """Return the luminance of an image message, of rclpy or of rosbags.
+
+    Parameters
+    ----------
+    message : sensor_msgs Image or CompressedImage
+        Whichever library made it.
+
+    Returns
+    -------
+    ndarray, shape (height, width), uint8, uint16 or float32
+        Without a copy where the message's layout allows it.
+
+    Raises
+    ------
+    EncodingError
+        If the image cannot be decoded.
+    """
+    if hasattr(message, "format"):  # CompressedImage
+        return decode_compressed(message.data, message.format)
+    return decode_image(
+        message.data,
+        message.encoding,
+        message.width,
+        message.height,
+        message.step,
+        message.is_bigendian,
+    )
+
+
 def decode_image(
     data: Any, encoding: str, width: int, height: int, step: int, is_bigendian: bool | int
 ) -> np.ndarray:

@@ -446,7 +446,7 @@ class RecorderParameters(Table):
     """What the recorder node reads."""
 
     output: str = _plain(
-        "", "recorder", "folder to write; empty: one named by the time, ofsat_...", live=False
+        "", "recorder", "folder to write; empty: one named by the time", live=False
     )
     overwrite: bool = _plain(
         False, "recorder", "replace what a recorder has left in the folder", live=False

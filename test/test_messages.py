@@ -11,7 +11,7 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
 from ofsat_ros.detection import DETECTION_DTYPE
-from ofsat_ros.images import EncodingError, encode_png
+from ofsat_ros.images import EncodingError, decode_message, encode_png
 from ofsat_ros.nodes import messages
 from ofsat_ros.optical_flow import Flow
 from ofsat_ros.pipeline import FrameResult
@@ -90,14 +90,14 @@ def test_image_there_and_back(dtype):
     message = messages.image_message(HEADER, pixels)
     assert message.header == HEADER
     assert (message.height, message.width, message.step) == (5, 7, 7 * pixels.itemsize)
-    back = messages.image_array(message)
+    back = decode_message(message)
     assert back.dtype == dtype
     np.testing.assert_array_equal(back, pixels)
 
 
 def test_image_buffer_is_used_without_a_copy():
     message = messages.image_message(HEADER, np.zeros((4, 6), np.uint16))
-    messages.image_array(message)[1, 2] = 0x0201
+    decode_message(message)[1, 2] = 0x0201
     at = 2 * (6 + 2)
     expected = [1, 2] if sys.byteorder == "little" else [2, 1]
     assert list(message.data[at : at + 2]) == expected
@@ -105,7 +105,7 @@ def test_image_buffer_is_used_without_a_copy():
 
 def test_part_of_an_image_becomes_a_whole_one():
     pixels = np.arange(100, dtype=np.uint8).reshape(10, 10)
-    back = messages.image_array(messages.image_message(HEADER, pixels[2:5, 3:9]))
+    back = decode_message(messages.image_message(HEADER, pixels[2:5, 3:9]))
     np.testing.assert_array_equal(back, pixels[2:5, 3:9])
 
 
@@ -119,14 +119,14 @@ def test_color_image_is_bgr():
 def test_compressed_image_keeps_16_bits():
     pixels = np.arange(400, dtype=np.uint16).reshape(20, 20) * 150
     message = CompressedImage(header=HEADER, format="png", data=encode_png(pixels))
-    np.testing.assert_array_equal(messages.image_array(message), pixels)
+    np.testing.assert_array_equal(decode_message(message), pixels)
 
 
 def test_an_image_that_is_too_short_is_an_encoding_error():
     message = messages.image_message(HEADER, np.zeros((4, 6), np.uint16))
     message.height = 5
     with pytest.raises(EncodingError, match="too short"):
-        messages.image_array(message)
+        decode_message(message)
 
 
 def test_cloud_has_the_fields_of_the_design():

@@ -13,6 +13,7 @@ from ros_graph import Graph, Process, sky, stamps, write_bag
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 
+from ofsat_ros.images import decode_message
 from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.player import Player
 from ofsat_ros.recordings import BagWriter
@@ -42,7 +43,7 @@ def test_waits_for_a_subscriber_and_loses_nothing(bag, tmp_path):
         assert "played 12 frames" in player.err
     assert stamps(heard) == TIMES
     assert {message.header.frame_id for message in heard} == {"camera_optical_frame"}
-    np.testing.assert_array_equal(messages.image_array(heard[7]), FRAMES[7].image)
+    np.testing.assert_array_equal(decode_message(heard[7]), FRAMES[7].image)
 
 
 def test_a_best_effort_subscriber_gets_first_and_last_frame(bag, stop):
@@ -115,7 +116,7 @@ def test_topic_is_chosen_and_compressed_images_go_out_as_they_are(tmp_path, stop
         graph.until(lambda: len(right) == 4)
         graph.until(stop.is_set)
     assert left == []
-    np.testing.assert_array_equal(messages.image_array(right[3]), FRAMES[3].image)
+    np.testing.assert_array_equal(decode_message(right[3]), FRAMES[3].image)
 
 
 def test_replay_waits_for_the_answers_of_a_detector(bag, stop):

@@ -8,6 +8,7 @@ from geometry_msgs.msg import QuaternionStamped
 from ros_graph import Graph, stamps
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
+from ofsat_ros.images import decode_message
 from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.simulator import Simulator, attitude_of
 from ofsat_ros.simulation import scenario
@@ -55,7 +56,7 @@ def geo() -> dict[str, list]:
 def truth_frames(geo) -> list:
     """The same frames, rendered here."""
     sky = scenario("geo", 7)
-    first_image = messages.image_array(geo["image"][0])
+    first_image = decode_message(geo["image"][0])
     frames = (sky.frame() for _ in range(10))
     frame = next((f for f in frames if np.array_equal(f.image, first_image)), None)
     assert frame, "the first image is none of the scenario's"
@@ -68,7 +69,7 @@ def test_images_are_the_scenarios(geo, truth_frames):
     assert stamps(geo["image"]) == [f.stamp_ns for f in truth_frames]
     for message, frame in zip(geo["image"], truth_frames, strict=True):
         assert message.encoding == "mono16"
-        np.testing.assert_array_equal(messages.image_array(message), frame.image)
+        np.testing.assert_array_equal(decode_message(message), frame.image)
 
 
 def test_truth_has_the_layout_of_detections(geo, truth_frames):

@@ -28,7 +28,7 @@ from visualization_msgs.msg import MarkerArray
 
 from ofsat_ros import report
 from ofsat_ros.detection import DETECTION_DTYPE
-from ofsat_ros.images import EncodingError
+from ofsat_ros.images import EncodingError, decode_message
 from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.health import Health
 from ofsat_ros.nodes.ros_parameters import NodeParameters, start_value
@@ -169,7 +169,7 @@ class Detector(Node):
             self._reset_wanted = ""
         scale = self._settings[DetectorParameters].marker_scale
         try:
-            image = messages.image_array(message)
+            image = decode_message(message)
             result = self._pipeline.process(image, messages.stamp_ns(message.header.stamp))
         except (EncodingError, ImageError) as error:
             self._fail(message.header, str(error))

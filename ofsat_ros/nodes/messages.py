@@ -17,12 +17,11 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, Vector3Stamped
-from sensor_msgs.msg import CompressedImage, Image, PointCloud2, PointField
+from sensor_msgs.msg import Image, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from ofsat_ros.detection import DETECTION_DTYPE
-from ofsat_ros.images import decode_compressed, decode_image
 from ofsat_ros.pipeline import FrameResult
 
 _NS = 1_000_000_000
@@ -109,30 +108,6 @@ def header_stamp_ns(data: bytes | memoryview, header_at: int = HEADER_AT) -> int
     # The second byte tells the byte order of what follows.
     sec, nanosec = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, header_at)
     return sec * _NS + nanosec
-
-
-def image_array(message: Image | CompressedImage) -> np.ndarray:
-    """Return the luminance of an image message, without a copy where its layout allows it.
-
-    Returns
-    -------
-    ndarray, shape (height, width), uint8, uint16 or float32
-
-    Raises
-    ------
-    ofsat_ros.images.EncodingError
-        If the image cannot be decoded.
-    """
-    if isinstance(message, CompressedImage):
-        return decode_compressed(message.data, message.format)
-    return decode_image(
-        message.data,
-        message.encoding,
-        message.width,
-        message.height,
-        message.step,
-        message.is_bigendian,
-    )
 
 
 def image_message(header: Header, image: np.ndarray) -> Image:

@@ -12,11 +12,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
-from ofsat_ros.images import EncodingError, decode_compressed, decode_image
+from ofsat_ros.images import EncodingError, decode_message
 from ofsat_ros.recordings.bag import COMPRESSED_IMAGE, IMAGE, Bag, RecordingError, Topic
 from ofsat_ros.recordings.bag_writer import BagWriter
 
@@ -158,7 +158,7 @@ class Recording:
         """Return a frame, or None and say why."""
         try:
             message = self._bag.deserialize(data, msgtype)
-            image = _image(message)
+            image = decode_message(message)
         except (RecordingError, EncodingError) as error:
             self._skip(number, f"{error}")
             return None
@@ -203,17 +203,3 @@ def _choose(bag: Bag, topic: str | None) -> str:
     if not images[name]:
         raise RecordingError(f"{bag.path}: topic {name} is empty; image topics are {listing}")
     return name
-
-
-def _image(message: Any) -> np.ndarray:
-    """Return the pixels of an Image or a CompressedImage."""
-    if message.__msgtype__ == COMPRESSED_IMAGE:
-        return decode_compressed(message.data, message.format)
-    return decode_image(
-        message.data,
-        message.encoding,
-        message.width,
-        message.height,
-        message.step,
-        message.is_bigendian,
-    )
