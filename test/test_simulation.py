@@ -1,8 +1,10 @@
 """The simulator: what it renders is what its settings and its truth say."""
 
 import dataclasses
+import itertools
 import math
 
+import cv2
 import numpy as np
 import pytest
 
@@ -369,6 +371,364 @@ def test_the_same_picture_at_every_bit_depth():
     assert np.allclose(deep.truth["flux"], shallow.truth["flux"] * 257)
 
 
+# --- what spoils a frame ----------------------------------------------------------------------
+
+
+def test_the_sky_rises_from_border_to_border():
+    sky = {"sky_percent": 4, "sky_gradient_percent": (3, -5)}
+    image = simulate(**{**NOISELESS, "width": 101, "height": 81}, **sky).frame().image
+    rows, columns = np.mgrid[:81, :101]
+    expected = 65535 / 100 * (4 + 3 * columns / 100 + 5 * (1 - rows / 80))
+    assert np.abs(image - expected).max() < 0.51  # rounding
+
+
+def test_the_skys_light_has_photon_noise_and_the_noises_mean_has_not():
+    settings = {**NOISELESS, "width": 300, "height": 200, "noise_mean_percent": 10}
+    image = simulate(sky_percent=5, electrons_per_dn=0.5, **settings).frame().image.astype(float)
+    count, variance = image.size, 0.05 * 65535 / 0.5
+    assert image.mean() == pytest.approx(0.15 * 65535, abs=5 * math.sqrt(variance / count))
+    assert image.var() == pytest.approx(variance + 1 / 12, rel=5 * math.sqrt(2 / count))
+
+
+def test_vignetting_takes_light_with_the_square_of_the_distance():
+    settings = {**NOISELESS, "width": 121, "height": 91, "vignetting": 0.4}
+    sky = simulate(sky_percent=50, **settings).frame().image / (0.5 * 65535)
+    assert sky[45, 60] == pytest.approx(1, abs=2e-5)  # rounding, half of 1 / 32768
+    assert [sky[y, x] for y in (0, -1) for x in (0, -1)] == pytest.approx([0.6] * 4, abs=2e-5)
+    assert sky[21, 28] == pytest.approx(1 - 0.4 * (32**2 + 24**2) / (60**2 + 45**2), abs=2e-5)
+    rso = RSO((28, 21), (0, 0), 100)
+    frame = simulate(rsos=(rso,), **settings).frame()
+    assert frame.truth["flux"][0] == pytest.approx(sky[21, 28] * 65535, rel=1e-3)
+    # Rounding, 0.29 DN rms in 121 pixels: 3 DN rms.
+    assert frame.image.sum(dtype=float) == pytest.approx(frame.truth["flux"][0], abs=15)
+    plain = simulate(rsos=(rso,), **{**settings, "vignetting": 0}).frame()
+    assert plain.truth["flux"][0] == pytest.approx(65535)
+    # The curve of the vignetting within the PSF is all that shows beside its depth.
+    ratio = frame.truth["snr"][0] / plain.truth["snr"][0]
+    assert ratio == pytest.approx(sky[21, 28], rel=1e-3)
+
+
+@pytest.mark.parametrize("std", [0.01, 0.1])
+def test_gains_act_on_light_and_are_fixed_in_the_sensor(std):
+    settings = {**NOISELESS, "width": 256, "height": 200, "gain_std": std}
+    simulator = simulate(sky_percent=40, camera_rate_arcsec_s=(50, 0), **settings)
+    first, second = (simulator.frame().image for _ in range(2))
+    gain = first / (0.4 * 65535)
+    assert np.array_equal(first, second)
+    assert gain.mean() == pytest.approx(1, abs=5 * std / math.sqrt(gain.size))
+    assert gain.std() == pytest.approx(std, rel=5 / math.sqrt(2 * gain.size))
+    # The same gains under other light; both are known to half a DN of rounding.
+    dimmer = simulate(sky_percent=20, **settings).frame().image / (0.2 * 65535)
+    assert np.abs(gain - dimmer).max() < 1e-4
+    # What is not light has none.
+    dark = simulate(**{**settings, "noise_mean_percent": 40}).frame().image
+    assert np.all(dark == round(0.4 * 65535))
+    other = simulate(sky_percent=40, seed=2, **settings).frame().image
+    assert abs(np.corrcoef(first.ravel(), other.ravel())[0, 1]) < 5 / math.sqrt(gain.size)
+
+
+def test_the_fixed_pattern_is_an_offset_that_stays():
+    settings = {**NOISELESS, "width": 256, "height": 200, "noise_mean_percent": 10}
+    settings["fixed_pattern_std_percent"] = 0.5
+    simulator = simulate(camera_rate_arcsec_s=(50, 0), **settings)
+    first, second = (simulator.frame().image.astype(float) for _ in range(2))
+    assert np.array_equal(first, second)
+    count, std = first.size, 0.005 * 65535
+    assert first.mean() == pytest.approx(0.1 * 65535, abs=5 * std / math.sqrt(count))
+    assert first.std() == pytest.approx(std, rel=5 / math.sqrt(2 * count))
+    # It adds to light, and does not scale it; both are rounded.
+    bright = simulate(sky_percent=30, **settings).frame().image
+    assert np.abs(bright - first - 0.3 * 65535).max() <= 1
+
+
+def test_hot_pixels_are_as_many_and_as_bright_as_asked_for_and_stay():
+    settings = {**NOISELESS, "width": 400, "height": 300, "hot_pixel_percent": (2, 50)}
+    simulator = simulate(hot_pixel_fraction=0.01, camera_rate_arcsec_s=(50, 0), **settings)
+    first, second = (simulator.frame().image for _ in range(2))
+    assert np.array_equal(first, second)
+    percent = first[first > 0] / 655.35
+    # Binomial: 1200 of 120,000, std 34.5.
+    assert len(percent) == pytest.approx(1200, abs=5 * 34.5)
+    assert percent.min() >= 2 - 1e-3
+    assert percent.max() <= 50 + 1e-3
+    # Even in the logarithm over a range of log(25): its mean is log(10), with a std of 1/sqrt(12).
+    spread = math.log(25) / math.sqrt(12 * len(percent))
+    assert np.log(percent).mean() == pytest.approx(math.log(10), abs=5 * spread)
+    rows, columns = np.nonzero(first)
+    assert np.histogram2d(rows, columns, 3)[0].min() > 133 - 5 * math.sqrt(133)  # everywhere
+    # All other pixels, and all other noise, are those of a sound sensor.
+    sound, hot = (
+        simulate(**{**settings, "noise_std_percent": 1, "noise_mean_percent": 5, **more}).frame()
+        for more in ({}, {"hot_pixel_fraction": 0.01})
+    )
+    assert np.array_equal(hot.image[first == 0], sound.image[first == 0])
+
+
+def test_hot_pixels_have_the_photon_noise_of_their_signal():
+    settings = {**NOISELESS, "hot_pixel_fraction": 1, "hot_pixel_percent": (2, 50)}
+    mean = simulate(**settings).frame().image.astype(float)
+    images = np.stack([f.image for f in simulate(electrons_per_dn=0.2, frames=60, **settings)])
+    ratio = images.var(axis=0, ddof=1) / (mean / 0.2)
+    # Each of the 60-frame variances has a relative std of sqrt(2/59).
+    assert ratio.mean() == pytest.approx(1, abs=5 * math.sqrt(2 / 59 / ratio.size))
+
+
+def test_dark_signal_has_no_gain_and_its_photon_noise_counts_in_the_snr():
+    dark = {**DARK, "hot_pixel_fraction": 1, "hot_pixel_percent": (20, 20)}
+    image = simulate(gain_std=0.3, **{**dark, "noise_std_percent": 0}).frame().image
+    assert np.all(image == 0.2 * 65535)
+    rso = RSO((30, 30), (0, 0), 100)
+    signal = simulate(rsos=(rso,), **NOISELESS).frame().image.astype(float)
+    variance = (0.01 * 65535) ** 2 + (signal + 0.2 * 65535) / 0.01
+    (snr,) = simulate(rsos=(rso,), electrons_per_dn=0.01, **dark).frame().truth["snr"]
+    # The template's rounding alone differs.
+    assert snr == pytest.approx(math.sqrt(np.sum(signal**2 / variance)), rel=1e-3)
+
+
+def rays_of(image):
+    """Number of pixels and the light, in percent, of each group of pixels that touch."""
+    count, labels = cv2.connectedComponents((image > 0).astype(np.uint8), connectivity=8)
+    pixels = np.bincount(labels.ravel(), minlength=count)[1:]
+    return pixels, np.bincount(labels.ravel(), image.ravel(), count)[1:] / 655.35
+
+
+def test_cosmic_rays_are_single_pixels_and_short_tracks_that_do_not_come_back():
+    settings = {**NOISELESS, "width": 512, "height": 512, "cosmic_ray_percent": (10, 20)}
+    images = [frame.image for frame in simulate(cosmic_ray_count=30, frames=12, **settings)]
+    assert max(np.count_nonzero((a > 0) & (b > 0)) for a, b in itertools.pairwise(images)) <= 6
+    found = [rays_of(image) for image in images]
+    counts = [len(pixels) for pixels, _ in found]
+    # Poisson, 30 a frame: the sum of 12 has a std of 19; a few touch another or leave the image.
+    assert sum(counts) == pytest.approx(360, abs=4 * 19)
+    assert np.std(counts) > 2
+    pixels, percent = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    single = pixels == 1
+    # Half, and those of the tracks that are too short to leave their pixel, about one in ten.
+    assert np.mean(single) == pytest.approx(0.55, abs=4 * math.sqrt(0.25 / 360))
+    # 10 to 20 % per pixel, in a single pixel and per px of a track.
+    whole = percent[single & (percent > 9.9)]
+    assert len(whole) > 0.95 * single.sum()
+    assert whole.max() <= 20.01
+    assert np.median(whole) == pytest.approx(math.sqrt(200), abs=1.0)
+    # Tracks: 4 px long in the mean, as far as they are not clipped.
+    length = percent[~single] / math.sqrt(200)
+    assert length.mean() == pytest.approx(4.4, abs=4 * 4 / math.sqrt(len(length)))
+    assert pixels.max() < 60
+    # Everything else is as it would be without.
+    noise = {**settings, "noise_std_percent": 1, "noise_mean_percent": 5}
+    clean, hit = simulate(**noise).frame(), simulate(cosmic_ray_count=30, **noise).frame()
+    untouched = images[0] == 0
+    assert np.array_equal(clean.image[untouched], hit.image[untouched])
+    assert np.all(hit.image[~untouched] > clean.image[~untouched])
+    assert hit.truth.tobytes() == clean.truth.tobytes()
+
+
+@pytest.mark.parametrize("cover", [0.1, 0.5, 1.0])
+def test_clouds_cover_the_share_of_the_sky(cover):
+    settings = {**NOISELESS, "cloud_cover": cover, "cloud_glow_percent": 50}
+    images = [simulate(seed=seed, **settings).frame().image for seed in range(60)]
+    covered = np.array([np.mean(image > 0) for image in images])
+    # An image sees a quarter of the pattern; what the 60 measure is known from their spread.
+    assert covered.mean() == pytest.approx(cover, abs=4 * covered.std() / math.sqrt(60) + 1e-3)
+    # Patchy, and up to the glow asked for.
+    assert max(image.max() for image in images) == round(0.5 * 65535)
+    assert covered.std() > 0.02 or cover == 1
+
+
+def test_clouds_drift():
+    clouds = {"cloud_cover": 0.5, "cloud_glow_percent": 80, "cloud_drift_px_s": (6, -4)}
+    simulator = simulate(**{**NOISELESS, **clouds, "width": 160, "height": 120}, period_s=2)
+    first, second = (simulator.frame().image.astype(int) for _ in range(2))
+    assert first.std() > 0.1 * 65535
+    # 2 s: 12 px to the right and 8 px up, whole pixels, so only rounding differs.
+    assert np.abs(second[:-8, 12:] - first[8:, :-12]).max() <= 1
+    assert np.abs(second - first).max() > 1000
+
+
+def test_clouds_take_from_stars_and_rsos_what_their_thickness_says():
+    clouds = {"cloud_cover": 0.7, "cloud_opacity": 0.6, "cloud_glow_percent": 20}
+    sky = {**NOISELESS, **clouds, "width": 200, "height": 200}
+    empty = simulate(**sky).frame().image.astype(float)
+    thickness = empty / (0.2 * 65535)
+    places_px = [(x, y) for x in (30, 70, 110, 150) for y in (40, 100, 160)]
+    rsos = [RSO(place, (0, 0), 100) for place in places_px]
+    frame = simulate(rsos=rsos, **sky).frame()
+    light = frame.image - empty
+    clear = simulate(rsos=rsos, **{**sky, "cloud_cover": 0}).frame()
+    for (x, y), truth, before in zip(places_px, frame.truth, clear.truth, strict=True):
+        around = np.s_[y - 10 : y + 11, x - 10 : x + 11]
+        left = np.average(1 - 0.6 * thickness[around], weights=clear.image[around])
+        # Rounding, of both images and in 441 pixels: 9 DN rms each.
+        assert truth["flux"] == pytest.approx(left * 65535, abs=45)
+        assert light[around].sum() == pytest.approx(truth["flux"], abs=45)
+        # The clouds' slope within the PSF is all that shows beside their thickness.
+        assert truth["snr"] / before["snr"] == pytest.approx(left, rel=0.01)
+    assert frame.truth["flux"].min() < 0.6 * 65535 < 0.9 * 65535 < frame.truth["flux"].max()
+    # Stars the same: all light, and every pixel of it.
+    stars = {"star_count": 60, "star_flux_percent": (20, 60)}
+    shaded, plain = (
+        simulate(**{**sky, **stars, "cloud_cover": cover}).frame().image for cover in (0.7, 0)
+    )
+    assert np.abs(shaded - empty - plain * (1 - 0.6 * thickness)).max() < 3  # rounding, thrice
+    assert plain.max() > 3000
+
+
+def test_clouds_fit_themselves_to_the_image():
+    clouds = {"cloud_cover": 0.5, "cloud_glow_percent": 50}
+    small, large = (
+        simulate(**{**NOISELESS, **clouds, "width": size, "height": size}).frame().image
+        for size in (64, 256)
+    )
+    shrunk = large.reshape(64, 4, 64, 4).mean(axis=(1, 3))
+    # Cells of 1 and of 4 px: half a cell of shift apart.
+    assert np.corrcoef(small.ravel(), shrunk.ravel())[0, 1] > 0.99
+
+
+def test_a_tumbling_rsos_flux_and_snr_vary_as_its_image_does():
+    tumble = {"flux_amplitude": 0.8, "flux_period_s": 7.0, "flux_phase_rad": 1.0}
+    steady = RSO((30, 31), (0, 0), 80)
+    settings = {**NOISELESS, "exposure_s": 2.0, "period_s": 3.0, "frames": 9, "subsamples": 40}
+    frames = list(simulate(rsos=(dataclasses.replace(steady, **tumble),), **settings))
+    flux = np.array([frame.truth["flux"][0] for frame in frames])
+    # The mean of 1 + a sin(w t + p) over an exposure: the sine in its middle times sinc(w T / 2).
+    middle = np.arange(9) * 3.0 + 1.0
+    half = math.pi / 7 * 2.0
+    sine = np.sin(2 * math.pi * middle / 7 + 1) * math.sin(half) / half
+    # The midpoint rule with 40 instants is wrong by (w T / 40)^2 / 24, 8e-5 of the amplitude.
+    assert flux == pytest.approx(0.8 * 65535 * (1 + 0.8 * sine), rel=5e-4)
+    assert flux.max() > 3 * flux.min()
+    light = np.array([frame.image.sum(dtype=float) for frame in frames])
+    assert light == pytest.approx(flux, abs=36)  # rounding, as above
+    snr = np.array([frame.truth["snr"][0] for frame in frames])
+    plain = simulate(rsos=(steady,), **settings).frame().truth[0]
+    assert snr / flux == pytest.approx(np.full(9, plain["snr"] / plain["flux"]))
+
+
+def test_a_tumbling_rsos_streak_varies_along_its_length():
+    # Half a period in the exposure, from the mean down and back: bright ends, a dark middle.
+    rso = RSO((12, 30), (200, 0), 500, flux_amplitude=1, flux_period_s=2, flux_phase_rad=math.pi)
+    image = simulate(rsos=(rso,), **{**NOISELESS, "subsamples": 100}).frame().image.astype(float)
+    profile = image.sum(axis=0)
+    # Per px: 5 times full scale over 40 px, times 1 - sin.  At an eighth, 1 - sin(pi/8).
+    assert profile[17] == pytest.approx(5 * 65535 / 40 * (1 - math.sin(math.pi / 8)), rel=0.05)
+    assert profile[32] < 0.02 * profile[17]
+
+
+def test_jitter_shifts_stars_and_rsos_alike_and_truth_has_it():
+    settings = {"camera_rate_arcsec_s": (10, -5), "field_rotation_rad_s": 0.001, "subsamples": 1}
+    settings |= {"width": 200, "height": 160, "star_count": 40}
+    settings["rsos"] = (RSO((100, 80), (10, -5), 100),)
+    shaken, steady = simulate(jitter_std_px=0.8, **settings), simulate(**settings)
+    errors = [np.full(2, np.nan)]
+    for _ in range(100):
+        frame, quiet = shaken.frame(), steady.frame()
+        error = (places(frame.truth) - places(quiet.truth))[0]
+        before, after = matched_stars(quiet.stars, frame.stars)
+        assert np.allclose(places(after) - places(before), error, atol=1e-9)
+        for axis, step in enumerate(("dx_px", "dy_px")):
+            more = error[axis] - errors[-1][axis]
+            assert np.allclose(after[step] - before[step], more, atol=1e-9, equal_nan=True)
+            # The star now at the centre is another, which the turn of 1 mrad moves otherwise.
+            moved = frame.displacement_px[axis] - quiet.displacement_px[axis]
+            assert moved == pytest.approx(more, abs=4e-3, nan_ok=True)
+        errors.append(error)
+    errors = np.array(errors[1:])
+    # Of 200 numbers: the std to 5 %, the means of 100 to 0.08 px; new in each frame.
+    assert errors.std() == pytest.approx(0.8, rel=4 * 0.05)
+    assert np.abs(errors.mean(axis=0)).max() < 4 * 0.08
+    assert abs(np.mean(errors[1:] * errors[:-1])) / 0.8**2 < 4 / math.sqrt(198)
+    # What the mount knows has no part in it.
+    assert shaken.pointing_arcsec == steady.pointing_arcsec
+
+
+def test_jitter_shows_in_the_image_as_in_truth():
+    simulator = simulate(rsos=(RSO((31, 30), (0, 0), 200),), jitter_std_px=2, **NOISELESS)
+    for _ in range(5):
+        frame = simulator.frame()
+        x, y = frame.truth["x_px"][0], frame.truth["y_px"][0]
+        assert centroid(frame.image, x, y) == pytest.approx((x, y), abs=0.01)
+        assert frame.truth["length_px"][0] == 0  # it holds during the exposure
+    assert math.hypot(x - 31, y - 30) > 0.1
+
+
+def test_jitter_is_along_the_images_axes_however_the_field_is_turned():
+    rsos = (RSO((31.5, 31.5), (0, 0), 100),)  # in the centre, where a turn doesn't move it
+    settings = {"rsos": rsos, "jitter_std_px": 2, **DARK}
+    still, turning = simulate(**settings), simulate(field_rotation_rad_s=1, **settings)
+    for _ in range(3):
+        assert np.allclose(places(still.frame().truth), places(turning.frame().truth))
+
+
+DEFECTS = {
+    "sky_percent": 8,
+    "sky_gradient_percent": (3, 2),
+    "vignetting": 0.5,
+    "gain_std": 0.08,
+    "fixed_pattern_std_percent": 1.0,
+}
+
+
+def test_truth_snr_counts_uneven_gains_offsets_sky_and_vignetting():
+    settings = {"width": 48, "height": 40, "star_count": 0, "rsos": (RSO((4, 4), (40, 20), 150),)}
+    draws = [
+        simulate(seed=seed, electrons_per_dn=0.05, **settings, **DEFECTS).frame()
+        for seed in range(500)
+    ]
+    clean = {**settings, **DEFECTS, "gain_std": 0, "fixed_pattern_std_percent": 0}
+    clean |= {"noise_std_percent": 0, "noise_mean_percent": 0}
+    level = simulate(**clean).frame().image.astype(float)
+    sky = simulate(**{**clean, "rsos": ()}).frame().image
+    signal = level - sky
+    variance = 2 * (0.01 * 65535) ** 2 + level / 0.05 + (0.08 * level) ** 2
+    weights = signal / variance
+    sums = np.array([np.sum(weights * (frame.image - sky - 0.05 * 65535.0)) for frame in draws])
+    (snr,) = draws[0].truth["snr"]
+    # Every seed is another sensor.  The std of 500 draws is known to 3.2 %.
+    assert snr == pytest.approx(sums.mean() / sums.std(ddof=1), rel=3 * 0.032)
+    # Each of them counts here, by more than that.
+    for name in ("sky_percent", "vignetting", "gain_std", "fixed_pattern_std_percent"):
+        without = {**settings, **DEFECTS, name: 0, "electrons_per_dn": 0.05}
+        assert simulate(**without).frame().truth["snr"][0] > 1.1 * snr
+
+
+@pytest.mark.parametrize("electrons_per_dn", [0, 0.02])
+@pytest.mark.parametrize("rate", [(0, 0), (100, -60)])
+@pytest.mark.parametrize("snr", [3, 40])
+def test_an_rso_may_be_given_by_its_snr(snr, rate, electrons_per_dn):
+    settings = {"sky_percent": 6, "gain_std": 0.02, "fixed_pattern_std_percent": 0.4}
+    settings |= {"width": 128, "height": 96, "star_count": 0, "subsamples": 20}
+    rso = RSO((50.3, 60.8), rate, snr=snr)
+    simulator = simulate(rsos=(rso,), electrons_per_dn=electrons_per_dn, **settings)
+    assert simulator.frame().truth["snr"][0] == pytest.approx(snr, rel=1e-6)
+    (found,) = simulator.rsos
+    assert found == dataclasses.replace(rso, flux_percent=found.flux_percent, snr=None)
+    again = simulate(rsos=(found,), electrons_per_dn=electrons_per_dn, **settings)
+    assert again.frame().truth["snr"][0] == pytest.approx(snr, rel=1e-6)
+
+
+def test_an_snr_is_of_the_whole_streak_and_of_the_mean_brightness():
+    # Half outside of the image, and dark in the first exposure.
+    rso = RSO((-0.5, 30), (0, 0), snr=20)
+    tumbling = RSO((30, 30), (0, 0), snr=20, flux_amplitude=0.5, flux_phase_rad=-math.pi / 2,
+                   flux_period_s=1000)  # fmt: skip
+    cut, dark = (simulate(rsos=(r,), **DARK).frame().truth["snr"][0] for r in (rso, tumbling))
+    assert cut == pytest.approx(20 / math.sqrt(2), rel=1e-6)
+    assert dark == pytest.approx(10, rel=1e-3)
+
+
+def test_each_kind_of_noise_has_its_own_stream():
+    # Adding one effect leaves all others as they were: what differs is what it adds.
+    base = {**DARK, **DEFECTS, "sky_percent": 8, "noise_mean_percent": 5}
+    plain = simulate(**base).frame().image.astype(float)
+    for more in (
+        {"hot_pixel_fraction": 0.02},
+        {"cosmic_ray_count": 3},
+        {"cloud_cover": 0.3, "cloud_glow_percent": 5},
+    ):
+        changed = simulate(**base, **more).frame().image.astype(float) != plain
+        assert 0 < np.mean(changed) < 0.7, more
+
+
 # --- seed, time, truth -------------------------------------------------------------------------
 
 
@@ -386,6 +746,15 @@ def test_same_seed_same_bytes():
         assert a.stamp_ns == c.stamp_ns
     # Other stars too, not just other noise.
     assert len(np.intersect1d(one[0].stars["flux"], other[0].stars["flux"])) == 0
+
+
+def test_same_seed_same_bytes_of_all_that_spoils():
+    one, two, other = (scenario("ugly", seed, width=96, height=80, frames=3) for seed in (5, 5, 6))
+    for a, b, c in zip(one, two, other, strict=True):
+        assert a.image.tobytes() == b.image.tobytes()
+        assert a.truth.tobytes() == b.truth.tobytes()
+        assert a.displacement_px.tobytes() == b.displacement_px.tobytes()
+        assert a.image.tobytes() != c.image.tobytes()
 
 
 def test_stamps_are_the_middle_of_the_exposures():
@@ -454,8 +823,10 @@ def test_truth_file(tmp_path):
 # --- scenarios --------------------------------------------------------------------------------
 
 
-def test_scenarios_are_the_four_with_a_line_each():
-    assert list(SCENARIOS) == ["geo", "sidereal", "survey", "empty"]
+def test_scenarios_have_a_line_each():
+    plain = ["geo", "sidereal", "survey", "empty", "fast", "slow"]
+    spoilt = ["hot_pixels", "vignetting", "clouds", "cosmic_rays", "tumbling", "jitter", "ugly"]
+    assert list(SCENARIOS) == plain + spoilt
     assert all(line and "\n" not in line for line in SCENARIOS.values())
 
 
@@ -517,6 +888,58 @@ def test_empty_has_stars_and_no_rso():
     )
 
 
+def test_fast_rsos_streak_and_slow_ones_creep():
+    for name, low, high in (("fast", 10, 60), ("slow", 0.5, 2)):
+        simulator = scenario(name)
+        truth = np.concatenate([frame.truth for frame in simulator])
+        first = truth[truth["frame"] == 0]
+        steps = np.hypot(first["vx_px_s"], first["vy_px_s"]) * simulator.settings.period_s
+        assert np.sort(steps)[[0, -1]] == pytest.approx([low, high])
+        assert first["snr"] == pytest.approx([60, 30, 15, 8, 5], rel=1e-6)
+        assert np.allclose(first["length_px"], steps * (0.5 if name == "fast" else 1))
+        assert simulator.frame().displacement_px == pytest.approx([0, 0])
+
+
+# Which settings make each scenario's effect, and where it shows.
+SPOILT = {
+    "hot_pixels": ("hot_pixel_fraction", "gain_std", "fixed_pattern_std_percent"),
+    "vignetting": ("vignetting", "sky_gradient_percent"),
+    "clouds": ("cloud_cover",),
+    "cosmic_rays": ("cosmic_ray_count",),
+    "jitter": ("jitter_std_px",),
+    "ugly": ("hot_pixel_fraction", "cloud_cover", "cosmic_ray_count", "jitter_std_px"),
+}
+
+
+@pytest.mark.parametrize("name", [*SPOILT, "tumbling", "fast", "slow"])
+def test_spoilt_scenarios_have_five_rsos_that_stay(name):
+    simulator = scenario(name, 2)
+    assert simulator.settings.width == simulator.settings.height == 512
+    frames = list(simulator)
+    assert 8 <= len(frames) <= 10
+    truth = np.concatenate([frame.truth for frame in frames])
+    assert truth[truth["frame"] == 0]["id"].tolist() == [1, 2, 3, 4, 5]
+    assert len(truth) >= 0.95 * 5 * len(frames)
+    assert truth["snr"].max() > 40
+    assert np.count_nonzero(truth["snr"] < 10) >= len(frames)
+
+
+@pytest.mark.parametrize("name", SPOILT)
+def test_spoilt_scenarios_show_their_effect(name):
+    spoilt = scenario(name).frame().image.astype(float)
+    for field in SPOILT[name]:
+        default = getattr(SimulatorSettings(), field)
+        cured = scenario(name, **{field: default}).frame().image
+        assert not np.array_equal(spoilt, cured), field
+
+
+def test_tumbling_rsos_flux_varies_by_more_than_2():
+    truth = np.concatenate([frame.truth for frame in scenario("tumbling")])
+    for number in range(1, 6):
+        flux = truth["flux"][truth["id"] == number]
+        assert flux.max() > 2 * flux.min()
+
+
 def test_scenario_takes_other_rsos():
     simulator = scenario("empty", rsos=[RSO((10, 10), (0, 0), 50)])
     assert simulator.rsos == (RSO((10, 10), (0, 0), 50),)
@@ -539,6 +962,13 @@ def test_scenario_takes_other_rsos():
         ({"camera_rate_arcsec_s": "15"}, "must be a pair of numbers"),
         ({"camera_rate_arcsec_s": (1, math.inf)}, "camera_rate_arcsec_s must be a number"),
         ({"star_flux_percent": (5, 2)}, r"must be \(least, greatest\), not \(5, 2\)"),
+        ({"hot_pixel_percent": (9, 3)}, r"must be \(least, greatest\), not \(9, 3\)"),
+        ({"cosmic_ray_percent": (0, 3)}, "cosmic_ray_percent must be a number within 0.001 to"),
+        ({"hot_pixel_fraction": 2}, "hot_pixel_fraction must be a number within 0 to 1, not 2"),
+        ({"gain_std": -0.1}, "gain_std must be a number within 0 to 0.5, not -0.1"),
+        ({"cloud_cover": math.inf}, "cloud_cover must be a number within 0 to 1, not inf"),
+        ({"sky_gradient_percent": 3}, "sky_gradient_percent must be a pair of numbers, not 3"),
+        ({"jitter_std_px": "0.5"}, "jitter_std_px must be a number within 0 to 100"),
         ({"exposure_s": 2.0}, "exposure_s .2. must not exceed period_s .1.: shorten"),
         ({"rsos": (1,)}, "rsos must be a sequence of RSO"),
         ({"rsos": 3}, "rsos must be a sequence of RSO"),
@@ -555,11 +985,21 @@ def test_bad_settings_are_refused_with_what_is_allowed(bad, message):
         ({"position_px": (1, 2, 3)}, "position_px must be a pair"),
         ({"rate_arcsec_s": (math.nan, 0)}, "rate_arcsec_s must be a number"),
         ({"flux_percent": -1}, "flux_percent must be a number within 0 to"),
+        ({"flux_percent": 5, "snr": 5}, r"flux_percent \(5\) or an snr \(5\), not both"),
+        ({"snr": 0}, "snr must be a number within 0.001 to 10000, not 0"),
+        ({"flux_amplitude": 1.5}, "flux_amplitude must be a number within 0 to 1, not 1.5"),
+        ({"flux_period_s": 0}, "flux_period_s must be a number within 0.001 to"),
     ],
 )
 def test_bad_rsos_are_refused(bad, message):
     with pytest.raises(ParameterError, match=message):
         RSO(**bad)
+
+
+def test_an_snr_that_no_flux_gives_is_refused():
+    # With gains uneven by 20 %, each of the dozen pixels that count adds at most an SNR of 5.
+    with pytest.raises(ParameterError, match=r"an snr of 100: lower it.*gain_std \(0.2\)"):
+        simulate(rsos=(RSO(snr=100),), gain_std=0.2, **DARK)
 
 
 def test_a_bad_camera_rate_is_refused_and_the_old_one_stays():

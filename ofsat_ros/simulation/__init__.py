@@ -14,10 +14,12 @@ stands still in the image.  In the image, at field angle a and rotation w about 
 with R(a) turning the x axis towards the y axis and J = R(90 deg).  The object's rate is in the
 axes of the sky, which are the image's at the start; the camera's in those of the image now.
 
-A frame is made in this order: light of the stars and RSOs, photon noise, sensor noise,
-quantisation.  Fluxes and noise are set in percent of full scale, so that a scenario looks the
-same at every bit depth.  Same settings, same bytes: whatever is random derives from the seed and
-from the sky's tile or the frame's number, never from what was rendered before.
+A frame is made in this order: light of the stars and RSOs (`rendering`); clouds and the sky's own
+light (`sky`); vignetting, gains of the pixels, dark signal, photon noise, offsets, sensor noise,
+cosmic rays, quantisation (`sensor`).  Fluxes and noise are set in percent of full scale, so that
+a scenario looks the same at every bit depth.  Same settings, same bytes: whatever is random
+derives from the seed and from the sky's tile or the frame's number, never from what was rendered
+before.
 """
 
 from ofsat_ros.simulation.scenarios import SCENARIOS, scenario

@@ -1,6 +1,7 @@
-"""How light becomes an image: sources to pixels, then photon noise, sensor noise, rounding.
+"""How the light of point sources falls on the pixels.
 
-Light is a flat array of all pixels, row after row, in DN without noise.
+It is the first step of a frame; `sky` and `sensor` act on what it gives.  Light is here and there
+a flat array of all pixels, row after row, in DN without noise.
 """
 
 from __future__ import annotations
@@ -80,41 +81,3 @@ def add_sources(
     for first in range(0, len(places), step):
         part = slice(first, first + step)
         np.add.at(light, *footprint(places[part], flux[part], settings))
-
-
-def matched_filter_snr(
-    index: np.ndarray, value: np.ndarray, light: np.ndarray, settings: SimulatorSettings
-) -> float:
-    """Return sqrt(sum s_i^2 / var_i) of a source in the light of everything.
-
-    ``index`` and ``value`` are those of `footprint`; the variance is that of all noise, rounding
-    (1/12 DN^2) included.
-    """
-    pixels, inverse = np.unique(index, return_inverse=True)
-    signal = np.bincount(inverse, value, len(pixels))
-    std = settings.noise_std_percent / 100 * settings.full_scale
-    variance = np.full(len(pixels), std**2 + 1 / 12)
-    if settings.electrons_per_dn:
-        variance += light[pixels] / settings.electrons_per_dn
-    return math.sqrt(np.sum(signal**2 / variance))
-
-
-def read_out(light: np.ndarray, frame: int, settings: SimulatorSettings) -> np.ndarray:
-    """Return the image, (height, width), that a sensor makes of the light in a frame."""
-    s, percent = settings, settings.full_scale / 100
-    level = _with_photon_noise(light, frame, s)
-    level += s.noise_mean_percent * percent
-    level += s.noise_std_percent * percent * s.random("sensor", frame).standard_normal(level.size)
-    image = np.rint(level).clip(0, s.full_scale).reshape(s.height, s.width)
-    return image.astype(np.uint8 if s.bit_depth == 8 else np.uint16)
-
-
-def _with_photon_noise(light: np.ndarray, frame: int, s: SimulatorSettings) -> np.ndarray:
-    level = light.copy()
-    if s.electrons_per_dn:
-        # Whether the end of a wing is 1e-17 or 0 differs between machines, and with it how many
-        # random numbers are drawn: so none are for less than this.
-        lit = np.flatnonzero(light > 1e-6)
-        electrons = s.random("photons", frame).poisson(light[lit] * s.electrons_per_dn)
-        level[lit] = electrons / s.electrons_per_dn
-    return level

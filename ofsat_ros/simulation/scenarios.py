@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from ofsat_ros.parameters import ParameterError
 from ofsat_ros.simulation.settings import RSO, SimulatorSettings
 from ofsat_ros.simulation.simulator import SkySimulator
 
 _STARS_PER_PX = 8e-4
+# One RSO each, from easy to barely visible.
+_SNRS = (60, 30, 15, 8, 5)
 
 
 class _Scene(NamedTuple):
@@ -22,14 +27,29 @@ class _Scene(NamedTuple):
 
 def _standing(s: SimulatorSettings) -> tuple[RSO, ...]:
     """Five RSOs that keep the camera's rate, from easy to faint, each in its own strip."""
-    fluxes = (250, 160, 100, 70, 50)
+    places = _in_strips(s)
+    return tuple(
+        RSO(place, s.camera_rate_arcsec_s, flux)
+        for place, flux in zip(places, (250, 160, 100, 70, 50), strict=True)
+    )
+
+
+def _tracked(s: SimulatorSettings) -> tuple[RSO, ...]:
+    """Five RSOs that keep the camera's rate, down to barely visible, each in its own strip."""
+    return tuple(
+        RSO(place, s.camera_rate_arcsec_s, snr=snr)
+        for place, snr in zip(_in_strips(s), _SNRS, strict=True)
+    )
+
+
+def _in_strips(s: SimulatorSettings) -> list[tuple[float, float]]:
     random = s.random("scenario")
     strips = random.permutation(5) + random.uniform(0.25, 0.75, 5)
     heights = random.uniform(0.1, 0.9, 5)
-    return tuple(
-        RSO((strip / 5 * s.width, height * s.height), s.camera_rate_arcsec_s, flux)
-        for strip, height, flux in zip(strips, heights, fluxes, strict=True)
-    )
+    return [
+        (strip / 5 * s.width, height * s.height)
+        for strip, height in zip(strips, heights, strict=True)
+    ]
 
 
 def _crossing(s: SimulatorSettings) -> tuple[RSO, ...]:
@@ -46,11 +66,53 @@ def _various(_: SimulatorSettings) -> tuple[RSO, ...]:
     return tuple(RSO(flux_percent=flux) for flux in (400, 250, 150, 100, 70, 50, 35, 25))
 
 
+def _moving(slowest: float, fastest: float) -> Callable[[SimulatorSettings], tuple[RSO, ...]]:
+    """Five RSOs in any direction, at speeds (px per frame against the stars) in even ratios.
+
+    They begin inside the image, and head so that they stay there in the scenario's frames as far
+    as their speed allows.
+    """
+
+    def rsos(s: SimulatorSettings) -> tuple[RSO, ...]:
+        random = s.random("scenario", 1)
+        size, count = np.array([s.width, s.height]), len(_SNRS)
+        # Shuffled: brightness says nothing of speed.
+        steps = random.permutation(np.geomspace(slowest, fastest, count))
+        angles = random.uniform(0, 2 * math.pi, count)
+        found = []
+        for snr, step, angle in zip(_SNRS, steps, angles, strict=True):
+            way = np.array([math.cos(angle), math.sin(angle)])
+            half_travel = min(step * s.frames / 2, 0.35 * size.min()) * way
+            room = 0.42 * size - abs(half_travel)
+            start = (size - 1) / 2 - half_travel + room * random.uniform(-1, 1, 2)
+            rate = step / s.period_s * s.pixel_scale_arcsec * way
+            found.append(RSO(tuple(start), tuple(rate), snr=snr))
+        return tuple(found)
+
+    return rsos
+
+
+def _tumbling(s: SimulatorSettings) -> tuple[RSO, ...]:
+    """Moving RSOs, each with its own amplitude, period and phase of the flux."""
+    random = s.random("scenario", 2)
+    return tuple(
+        dataclasses.replace(
+            rso,
+            flux_amplitude=random.uniform(0.4, 0.9),
+            flux_period_s=s.period_s * random.uniform(3, 12),
+            flux_phase_rad=random.uniform(0, 2 * math.pi),
+        )
+        for rso in _moving(3, 12)(s)
+    )
+
+
+# The camera of "geo": the sky turns at 15.04 arcsec/s; its x axis is 10 degrees off east-west.
+_AT_REST = {"camera_rate_arcsec_s": (14.81, 2.61), "exposure_s": 2.0, "period_s": 2.5}
+
 _SCENES = {
     "geo": _Scene(
         "five stationary RSOs among streaking stars: the camera stands still on the ground",
-        # The sky turns at 15.04 arcsec/s; the camera's x axis is 10 degrees off east-west.
-        {"camera_rate_arcsec_s": (14.81, 2.61), "exposure_s": 2.0, "period_s": 2.5, "frames": 40},
+        {**_AT_REST, "frames": 40},
         _standing,
     ),
     "sidereal": _Scene(
@@ -67,6 +129,84 @@ _SCENES = {
         "stars that streak a little and nothing else: whatever is found is a false alarm",
         {"camera_rate_arcsec_s": (-9.0, 6.0), "frames": 60},
         lambda _: (),
+    ),
+    "fast": _Scene(
+        "the camera tracks the stars; RSOs streak at 10 to 60 px a frame",
+        {"exposure_s": 0.5, "subsamples": 30, "frames": 8},
+        _moving(10, 60),
+    ),
+    "slow": _Scene(
+        "the camera tracks the stars; RSOs creep at 0.5 to 2 px a frame",
+        {"frames": 10},
+        _moving(0.5, 2),
+    ),
+    "hot_pixels": _Scene(
+        "stationary RSOs among streaking stars, hot pixels, uneven gains and offsets",
+        {
+            **_AT_REST,
+            "frames": 10,
+            "sky_percent": 10,
+            "hot_pixel_fraction": 1e-3,
+            "gain_std": 0.02,
+            "fixed_pattern_std_percent": 0.4,
+        },
+        _tracked,
+    ),
+    "vignetting": _Scene(
+        "moving RSOs over a sky that is brighter below and darker in the corners",
+        {
+            "frames": 8,
+            "sky_percent": 10,
+            "sky_gradient_percent": (-1, 7),
+            "vignetting": 0.25,
+            "gain_std": 0.01,
+        },
+        _moving(3, 12),
+    ),
+    "clouds": _Scene(
+        "moving RSOs and stars that fade behind drifting clouds",
+        {
+            "frames": 10,
+            "cloud_cover": 0.4,
+            "cloud_opacity": 0.9,
+            "cloud_glow_percent": 3,
+            "cloud_drift_px_s": (7, 4),
+        },
+        _moving(3, 12),
+    ),
+    "cosmic_rays": _Scene(
+        "moving RSOs, and each frame with some 20 cosmic rays",
+        {"frames": 10, "cosmic_ray_count": 20},
+        _moving(3, 12),
+    ),
+    "tumbling": _Scene(
+        "moving RSOs whose brightness varies within 3 to 12 frames",
+        {"frames": 10},
+        _tumbling,
+    ),
+    "jitter": _Scene(
+        "moving RSOs, and a mount that shakes by 0.7 px",
+        {"frames": 10, "jitter_std_px": 0.7},
+        _moving(3, 12),
+    ),
+    "ugly": _Scene(
+        "moving RSOs with all of it at once: defects, clouds, cosmic rays, tumbling, jitter",
+        {
+            "frames": 10,
+            "sky_percent": 10,
+            "sky_gradient_percent": (-1, 7),
+            "vignetting": 0.15,
+            "gain_std": 0.01,
+            "fixed_pattern_std_percent": 0.4,
+            "hot_pixel_fraction": 5e-4,
+            "cosmic_ray_count": 10,
+            "cloud_cover": 0.2,
+            "cloud_opacity": 0.5,
+            "cloud_glow_percent": 2,
+            "cloud_drift_px_s": (7, 4),
+            "jitter_std_px": 0.4,
+        },
+        _tumbling,
     ),
 }
 SCENARIOS: Mapping[str, str] = {name: scene.summary for name, scene in _SCENES.items()}

@@ -13,7 +13,10 @@ from ofsat_ros.parameters import ParameterError
 
 _NEW_YEAR_2026_NS = 1_767_225_600_000_000_000
 # The position of a purpose is part of its streams' seed: add at the end only.
-_PURPOSES = ("stars", "rsos", "photons", "sensor", "scenario")
+_PURPOSES = (
+    "stars", "rsos", "photons", "sensor", "scenario", "jitter", "clouds", "gain",
+    "fixed_pattern", "hot_pixels", "cosmic_rays",
+)  # fmt: skip
 
 Pair = tuple[float, float]
 
@@ -46,24 +49,39 @@ class RSO:
         Angular rate against the stars along the image's x and y at the start, arcsec/s.
     flux_percent : float or None
         Light of one exposure, summed over its pixels, in percent of full scale.
+    snr : float or None
+        Gives the flux by the SNR that the whole streak of the first exposure then has on plain
+        sky: without stars, clouds, vignetting and hot pixels.  None: `flux_percent` counts.
+    flux_amplitude, flux_period_s, flux_phase_rad : float
+        An RSO that tumbles: t after the first exposure begins, its flux is that given above
+        times ``1 + amplitude * sin(2 pi t / period + phase)``.
 
     Raises
     ------
     ParameterError
-        If a value is not a finite number of its range.
+        If a value is not a finite number of its range, or if both flux and SNR are given.
     """
 
     position_px: Pair | None = None
     rate_arcsec_s: Pair | None = None
     flux_percent: float | None = None
+    snr: float | None = None
+    flux_amplitude: float = 0.0
+    flux_period_s: float = 10.0
+    flux_phase_rad: float = 0.0
 
     def __post_init__(self) -> None:
         for name, limit in (("position_px", 1e6), ("rate_arcsec_s", 1e6)):
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, check_pair(name, value, -limit, limit))
-        if self.flux_percent is not None:
-            flux = _check_number("flux_percent", self.flux_percent, 0.0, 1e6, False)
-            object.__setattr__(self, "flux_percent", flux)
+        for name, (low, high) in _RSO_RANGES.items():
+            if (value := getattr(self, name)) is not None:
+                object.__setattr__(self, name, _check_number(name, value, low, high, False))
+        if self.flux_percent is not None and self.snr is not None:
+            raise ParameterError(
+                f"an RSO has a flux_percent ({self.flux_percent:g}) or an snr ({self.snr:g}),"
+                " not both: leave one out"
+            )
 
 
 @dataclass(frozen=True)
@@ -107,6 +125,40 @@ class SimulatorSettings:
         Least and greatest speed of an RSO whose rate is drawn; any direction is as likely.
     random_flux_percent : (float, float)
         Least and greatest flux of an RSO whose flux is drawn, even in its logarithm.
+    sky_percent : float
+        Light of the sky in every pixel, in percent of full scale, on top of the noise's mean; it
+        has photon noise, and vignetting and gain act on it.
+    sky_gradient_percent : (float, float)
+        How much more light the sky has at the right (bottom) border than at the left (top), or
+        if negative the reverse; nothing is taken from the darker side.
+    cloud_cover : float
+        Share of the sky that is under clouds.  Their pattern fits itself to the image's size.
+    cloud_opacity : float
+        Share of the light of stars and RSOs that the thickest cloud takes.
+    cloud_glow_percent : float
+        Light that the thickest cloud adds to a pixel, percent of full scale.
+    cloud_drift_px_s : (float, float)
+        Rate of the clouds along the image's x and y, px/s, whatever the camera does.
+    vignetting : float
+        Share of all light that is lost in the image's corners; it grows with the square of the
+        distance from the centre.
+    gain_std : float
+        Standard deviation of the pixels' gains around 1, fixed in the sensor.
+    fixed_pattern_std_percent : float
+        Standard deviation of the pixels' offsets, fixed in the sensor, percent of full scale.
+    hot_pixel_fraction : float
+        Share of the pixels that are hot, fixed in the sensor.
+    hot_pixel_percent : (float, float)
+        Least and greatest dark signal of a hot pixel, percent of full scale, even in its
+        logarithm; it has photon noise.
+    cosmic_ray_count : float
+        Mean number of cosmic rays in a frame: half hit one pixel, half leave a short track.
+    cosmic_ray_percent : (float, float)
+        Least and greatest signal of a cosmic ray per pixel of its path, percent of full scale,
+        even in its logarithm.
+    jitter_std_px : float
+        Standard deviation, along x and along y, of the pointing's error in each frame, px.  It
+        shifts stars and RSOs alike, is new in each frame, and holds during the exposure.
     start_stamp_ns : int
         UTC when the first exposure begins, ns.
     seed : int
@@ -137,6 +189,20 @@ class SimulatorSettings:
     rsos: tuple[RSO, ...] = ()
     random_speed_arcsec_s: Pair = (5.0, 30.0)
     random_flux_percent: Pair = (30.0, 300.0)
+    sky_percent: float = 0.0
+    sky_gradient_percent: Pair = (0.0, 0.0)
+    cloud_cover: float = 0.0
+    cloud_opacity: float = 0.8
+    cloud_glow_percent: float = 0.0
+    cloud_drift_px_s: Pair = (0.0, 0.0)
+    vignetting: float = 0.0
+    gain_std: float = 0.0
+    fixed_pattern_std_percent: float = 0.0
+    hot_pixel_fraction: float = 0.0
+    hot_pixel_percent: Pair = (5.0, 100.0)
+    cosmic_ray_count: float = 0.0
+    cosmic_ray_percent: Pair = (5.0, 100.0)
+    jitter_std_px: float = 0.0
     start_stamp_ns: int = _NEW_YEAR_2026_NS
     seed: int = 1
 
@@ -149,7 +215,7 @@ class SimulatorSettings:
             else:
                 value = _check_number(name, value, low, high, isinstance(default, int))
             object.__setattr__(self, name, value)
-        for name in ("star_flux_percent", "random_speed_arcsec_s", "random_flux_percent"):
+        for name in _LEAST_AND_GREATEST:
             low, high = getattr(self, name)
             if low > high:
                 raise ParameterError(f"{name} must be (least, greatest), not ({low:g}, {high:g})")
@@ -174,6 +240,17 @@ class SimulatorSettings:
         return np.random.Generator(np.random.PCG64(np.random.SeedSequence(words)))
 
 
+_RSO_RANGES: dict[str, Pair] = {
+    "flux_percent": (0.0, 1e6),
+    "snr": (1e-3, 1e4),
+    "flux_amplitude": (0.0, 1.0),
+    "flux_period_s": (1e-3, 1e6),
+    "flux_phase_rad": (-10.0, 10.0),
+}
+_LEAST_AND_GREATEST = (
+    "star_flux_percent", "random_speed_arcsec_s", "random_flux_percent",
+    "hot_pixel_percent", "cosmic_ray_percent",
+)  # fmt: skip
 RANGES: dict[str, Pair] = {
     "width": (16, 16384),
     "height": (16, 16384),
@@ -193,6 +270,20 @@ RANGES: dict[str, Pair] = {
     "electrons_per_dn": (0.0, 1e6),
     "random_speed_arcsec_s": (0.0, 1e6),
     "random_flux_percent": (1e-3, 1e6),
+    "sky_percent": (0.0, 100.0),
+    "sky_gradient_percent": (-100.0, 100.0),
+    "cloud_cover": (0.0, 1.0),
+    "cloud_opacity": (0.0, 1.0),
+    "cloud_glow_percent": (0.0, 100.0),
+    "cloud_drift_px_s": (-1e4, 1e4),
+    "vignetting": (0.0, 1.0),
+    "gain_std": (0.0, 0.5),
+    "fixed_pattern_std_percent": (0.0, 100.0),
+    "hot_pixel_fraction": (0.0, 1.0),
+    "hot_pixel_percent": (1e-3, 1e6),
+    "cosmic_ray_count": (0.0, 1e4),
+    "cosmic_ray_percent": (1e-3, 1e6),
+    "jitter_std_px": (0.0, 100.0),
     "start_stamp_ns": (0, 2**62),
     "seed": (0, 2**31 - 1),
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -12,7 +13,9 @@ import numpy as np
 
 from ofsat_ros.parameters import ParameterError
 from ofsat_ros.simulation import rendering
+from ofsat_ros.simulation.sensor import Sensor
 from ofsat_ros.simulation.settings import RANGES, RSO, Pair, SimulatorSettings, check_pair
+from ofsat_ros.simulation.sky import Sky
 
 TRUTH_DTYPE = np.dtype(
     [("stamp_ns", "i8"), ("frame", "i4"), ("id", "u4")]
@@ -43,15 +46,20 @@ class SimulatedFrame:
         Number of the frame, from 0.
     truth : numpy.ndarray
         TRUTH_DTYPE, a row for each RSO whose centre is inside the image: position at
-        mid-exposure and velocity in the image then; ``flux`` in DN; ``snr`` of a matched filter,
-        sqrt(sum s_i^2 / var_i) over its pixels, with var_i of all noise, rounding included, and
-        saturation left out of account; ``length_px`` of its streak.
+        mid-exposure, jitter included, and velocity in the image then, without it; ``flux`` in
+        DN, as clouds and vignetting leave it, in the mean of this exposure; ``snr`` of a matched
+        filter on this one frame, sqrt(sum s_i^2 / var_i) over the pixels that see that flux;
+        ``length_px`` of its streak.  var_i has all that is random to whoever doesn't know the
+        sensor: photon noise of all light and dark signal, sensor noise, rounding, the offsets'
+        variance, and that of the gains times the light squared.  Left out: the levels of stars,
+        sky and hot pixels, taken as known; cosmic rays; saturation.
     stars : numpy.ndarray
         STAR_DTYPE, a row for each star whose centre is inside: position at mid-exposure,
-        velocity, displacement since the frame before (NaN in the first frame), flux in DN.
+        velocity, displacement since the frame before (NaN in the first frame), flux in DN before
+        clouds and vignetting.
     displacement_px : numpy.ndarray
-        (2,), displacement since the frame before of a star now at the image's centre, px; NaN in
-        the first frame.
+        (2,), displacement since the frame before of a star now at the image's centre, px, jitter
+        included; NaN in the first frame.
     rotation_rad : float
         Turn of the field since the frame before, x axis towards y axis; NaN in the first frame.
     """
@@ -91,6 +99,14 @@ class _Sources(NamedTuple):
     flux: np.ndarray
 
 
+class _Spot(NamedTuple):
+    """What arrives of an RSO: pixels of the flat image, light in each (DN), flux (DN)."""
+
+    pixels: np.ndarray
+    signal: np.ndarray
+    flux: float
+
+
 class SkySimulator:
     """A camera that drifts over an endless sky of stars with RSOs among them.
 
@@ -107,23 +123,29 @@ class SkySimulator:
     settings : SimulatorSettings
         As given.
     rsos : tuple of RSO
-        The RSOs of the settings, with what was left open drawn.
+        The RSOs of the settings, with what was left open drawn, and the flux in place of an SNR.
+
+    Raises
+    ------
+    ParameterError
+        If no flux gives an RSO its SNR.
     """
 
     def __init__(self, settings: SimulatorSettings | None = None) -> None:
         self.settings = settings = settings or SimulatorSettings()
         self.camera_rate_arcsec_s = settings.camera_rate_arcsec_s
-        self.rsos = _drawn(settings)
+        rsos = _drawn(settings)
+        self._sky, self._sensor = Sky(settings), Sensor(settings)
         self._centre = complex(settings.width - 1, settings.height - 1) / 2
         self._pose = _Pose(0j, 0.0)
         self._last: _Pose | None = None
         self._frame = 0
-        position = _complex([rso.position_px for rso in self.rsos])
-        self._rsos = _Sources(
-            (position - self._centre) * settings.pixel_scale_arcsec,
-            _complex([rso.rate_arcsec_s for rso in self.rsos]),
-            np.array([rso.flux_percent for rso in self.rsos], float) * settings.full_scale / 100,
-        )
+        position = _complex([rso.position_px for rso in rsos])
+        sky = (position - self._centre) * settings.pixel_scale_arcsec
+        rate = _complex([rso.rate_arcsec_s for rso in rsos])
+        self.rsos = self._with_fluxes(rsos, _Sources(sky, rate, np.ones(len(rsos))))
+        flux = np.array([rso.flux_percent for rso in self.rsos], float) * settings.full_scale / 100
+        self._rsos = _Sources(sky, rate, flux)
 
     @property
     def camera_rate_arcsec_s(self) -> Pair:
@@ -151,7 +173,10 @@ class SkySimulator:
 
     @property
     def pointing_arcsec(self) -> Pair:
-        """Where the camera points when the next exposure begins, from the start, arcsec."""
+        """Where the camera points when the next exposure begins, from the start, arcsec.
+
+        Of the mount, which knows nothing of the jitter.
+        """
         return float(self._pose.pointing.real), float(self._pose.pointing.imag)
 
     @property
@@ -169,24 +194,12 @@ class SkySimulator:
     def frame(self) -> SimulatedFrame:
         """Expose one frame at the current rate, and move on to the start of the next."""
         s, number, start = self.settings, self._frame, self._frame * self.settings.period_s
-        seconds = (np.arange(s.subsamples) + 0.5) / s.subsamples * s.exposure_s
-        path, middle = self._after(seconds), self._after(s.exposure_s / 2)
+        middle = self._jittered(self._after(s.exposure_s / 2))
         stars = self._stars_near(middle)
-
-        light = np.zeros(s.height * s.width)
-        self._add_stars(light, self._project(stars, path, start + seconds), stars.flux)
-        spots = [
-            rendering.footprint(track, np.full(s.subsamples, flux / s.subsamples), s)
-            for track, flux in zip(
-                self._project(self._rsos, path, start + seconds), self._rsos.flux, strict=True
-            )
-        ]
-        for index, value in spots:
-            np.add.at(light, index, value)
-
+        light, spots = self._exposure(stars, start)
         stamp = s.start_stamp_ns + round((start + s.exposure_s / 2) * 1e9)
         frame = SimulatedFrame(
-            image=rendering.read_out(light, number, s),
+            image=self._sensor.read_out(light, number),
             stamp_ns=stamp,
             frame=number,
             truth=self._truth(middle, spots, light, stamp),
@@ -199,6 +212,58 @@ class SkySimulator:
 
     def _after(self, seconds: Any) -> _Pose:
         return self._pose.after(seconds, self._rate, self.settings.field_rotation_rad_s)
+
+    def _jittered(self, pose: _Pose) -> _Pose:
+        s = self.settings
+        if not s.jitter_std_px:
+            return pose
+        x, y = s.jitter_std_px * s.random("jitter", self._frame).standard_normal(2)
+        error = complex(x, y) * s.pixel_scale_arcsec * np.exp(-1j * pose.angle)
+        return pose._replace(pointing=pose.pointing - error)
+
+    def _exposure(self, stars: _Sources, start: float) -> tuple[np.ndarray, list[_Spot]]:
+        """Light that arrives at the pixels in the exposure that begins now, and the RSOs' part."""
+        s = self.settings
+        seconds = self._instants()
+        path, time = self._jittered(self._after(seconds)), start + seconds
+        light = np.zeros(s.height * s.width)
+        self._add_stars(light, self._project(stars, path, time), stars.flux)
+        transmission, sky_light = self._sky.at(start + s.exposure_s / 2)
+        spots = []
+        for rso, track, flux in zip(
+            self.rsos, self._project(self._rsos, path, time), self._rsos.flux, strict=True
+        ):
+            brightness = _brightness(rso, time)
+            index, value = rendering.footprint(track, flux / s.subsamples * brightness, s)
+            np.add.at(light, index, value)
+            kept = value * transmission[index] * self._sensor.vignetting[index]
+            share = kept.sum() / value.sum() if value.any() else 1.0
+            spots.append(_Spot(index, kept, flux * brightness.mean() * share))
+        return (light * transmission + sky_light) * self._sensor.vignetting, spots
+
+    def _instants(self) -> np.ndarray:
+        """Times of the subsamples since an exposure began, s."""
+        s = self.settings
+        return (np.arange(s.subsamples) + 0.5) / s.subsamples * s.exposure_s
+
+    def _with_fluxes(self, rsos: tuple[RSO, ...], sources: _Sources) -> tuple[RSO, ...]:
+        """Return the RSOs with the flux in place of the SNR."""
+        s, seconds = self.settings, self._instants()
+        background = float(self._sky.light.mean())
+        found = []
+        for rso, track in zip(
+            rsos, self._project(sources, self._after(seconds), seconds), strict=True
+        ):
+            if rso.snr is not None:
+                # In the image's middle, so that no border cuts it, at its own phase of the pixel.
+                way = self._centre - track.mean()
+                track = track + complex(round(way.real), round(way.imag))
+                spot = rendering.footprint(track, np.full(s.subsamples, 1 / s.subsamples), s)
+                flux = self._sensor.flux_for_snr(rso.snr, *spot, background)
+                percent = flux / s.full_scale * 100
+                rso = dataclasses.replace(rso, flux_percent=percent, snr=None)
+            found.append(rso)
+        return tuple(found)
 
     def _project(self, sources: _Sources, pose: _Pose, time: Any) -> np.ndarray:
         """Places in the image, (sources, instants), px, at poses and times since the start."""
@@ -240,7 +305,7 @@ class SkySimulator:
     def _truth(
         self,
         pose: _Pose,
-        spots: list[tuple[np.ndarray, np.ndarray]],
+        spots: list[_Spot],
         light: np.ndarray,
         stamp_ns: int,
     ) -> np.ndarray:
@@ -251,8 +316,8 @@ class SkySimulator:
         seen = np.flatnonzero(self._inside(place))
         table = _motion_table(TRUTH_DTYPE, place[seen], velocity[seen])
         table["stamp_ns"], table["frame"], table["id"] = stamp_ns, self._frame, seen + 1
-        table["snr"] = [rendering.matched_filter_snr(*spots[i], light, s) for i in seen]
-        table["flux"] = self._rsos.flux[seen]
+        table["snr"] = [self._sensor.snr(spots[i].pixels, spots[i].signal, light) for i in seen]
+        table["flux"] = [spots[i].flux for i in seen]
         table["length_px"] = abs(velocity[seen]) * s.exposure_s
         return table
 
@@ -299,14 +364,19 @@ def _drawn(settings: SimulatorSettings) -> tuple[RSO, ...]:
         x, y = random.uniform(0.1, 0.9, 2) * (settings.width - 1, settings.height - 1)
         speed, angle = random.uniform(slow, fast), random.uniform(0, 2 * math.pi)
         flux = faint * (bright / faint) ** random.uniform()
+        if rso.flux_percent is None and rso.snr is None:
+            rso = dataclasses.replace(rso, flux_percent=flux)
+        rate = rso.rate_arcsec_s or (speed * math.cos(angle), speed * math.sin(angle))
         drawn.append(
-            RSO(
-                rso.position_px or (x, y),
-                rso.rate_arcsec_s or (speed * math.cos(angle), speed * math.sin(angle)),
-                flux if rso.flux_percent is None else rso.flux_percent,
-            )
+            dataclasses.replace(rso, position_px=rso.position_px or (x, y), rate_arcsec_s=rate)
         )
     return tuple(drawn)
+
+
+def _brightness(rso: RSO, time_s: np.ndarray) -> np.ndarray:
+    """Flux at times since the first exposure began, against its mean."""
+    phase = 2 * math.pi * time_s / rso.flux_period_s + rso.flux_phase_rad
+    return 1 + rso.flux_amplitude * np.sin(phase)
 
 
 def _tile(column: int, row: int, s: SimulatorSettings) -> tuple[np.ndarray, np.ndarray]:
