@@ -24,12 +24,12 @@ ROS = [
     *OPENCV,
 ]
 LINT = ["mypy>=2.4,<3", "ruff>=0.17,<0.18", "types-PyYAML", "types-tqdm"]
+BENCH = ["matplotlib", "sep"]
 TEST = [
     "colcon-core",
     "colcon-ros",
     "hypothesis",
     "pytest>=9",
-    "scipy",
     "setuptools>=70.1,<80",  # the range in which colcon and pip can both build with it
 ]
 
@@ -56,13 +56,14 @@ setup(
         (f"share/{NAME}/config", sorted(glob(f"{NAME}/presets/*.yaml") + glob(f"{NAME}/data/*"))),
     ],
     zip_safe=False,
-    install_requires=["click", "numpy>=1.26", "PyYAML", "rosbags>=0.11", "tqdm"],
+    install_requires=["click", "numpy>=1.26", "PyYAML", "rosbags>=0.11", "scipy>=1.11", "tqdm"],
     extras_require={
         "ros": ROS,
         "opencv": OPENCV,
         "lint": LINT,
         "test": TEST,
-        "all": [*ROS, *LINT, *TEST],
+        "bench": BENCH,
+        "all": [*ROS, *LINT, *TEST, *BENCH],
     },
     entry_points={
         "console_scripts": [

@@ -1,13 +1,14 @@
 """The ``ofsat`` command: what needs no ROS graph.
 
-``process`` runs the same `Pipeline` as the detector node over a recording; ``simulate`` makes a
-recording with truth.  Exit code 0: done; 1: the input or output is not usable; 2: bad usage;
-130: stopped by Ctrl-C, with what was done so far on disk.  The summary goes to standard output;
-progress, notes and errors to standard error.
+``process`` runs the same `Pipeline` as the detector node over a recording; ``evaluate`` compares
+its results with truth; ``simulate`` makes a recording with truth.  Exit code 0: done; 1: the input
+or output is not usable; 2: bad usage; 130: stopped by Ctrl-C, with what was done so far on disk.
+The summary goes to standard output; progress, notes and errors to standard error.
 """
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -16,9 +17,21 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import click
+import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from ofsat_ros import __version__
+from ofsat_ros.detection import CONFIRMED
+from ofsat_ros.evaluation import (
+    EvaluationError,
+    count_frames,
+    read_detections,
+    read_truth,
+)
+from ofsat_ros.evaluation import (
+    evaluate as evaluate_detections,
+)
 from ofsat_ros.parameters import (
     DEFAULT_PRESET,
     Description,
@@ -28,8 +41,9 @@ from ofsat_ros.parameters import (
 )
 from ofsat_ros.pipeline import ImageError, Pipeline
 from ofsat_ros.recordings import BagWriter, Recording, RecordingError, open_recording
-from ofsat_ros.results import DETECTIONS, STAR_FIELD, ResultWriter
+from ofsat_ros.results import DETECTIONS, STAR_FIELD, TRACKS, ResultWriter
 from ofsat_ros.simulation import SCENARIOS, scenario, write_truth
+from ofsat_ros.tracking import Settled
 
 IMAGE_TOPIC = "/camera/image_raw"
 FRAME_ID = "camera_optical_frame"
@@ -66,10 +80,16 @@ def _option_type(about: Description) -> Any:
     "--output",
     required=True,
     type=click.Path(file_okay=False, path_type=Path),
-    help=f"folder for {DETECTIONS} and {STAR_FIELD}",
+    help=f"folder for {DETECTIONS}, {TRACKS} and {STAR_FIELD}",
 )
 @click.option("--topic", help="image topic, if the recording holds several")
 @click.option("--preset", default=DEFAULT_PRESET, type=click.Choice(preset_names()))
+@click.option(
+    "--live",
+    is_flag=True,
+    help="write what the node would say at each frame, candidates included; without it, a track"
+    " labels what it was seen as before it was confirmed",
+)
 @click.option("--force", is_flag=True, help="replace the results of an earlier run")
 @_parameter_options
 def process(
@@ -77,6 +97,7 @@ def process(
     output: Path,
     topic: str | None,
     preset: str,
+    live: bool,
     force: bool,
     **changes: Any,
 ) -> None:
@@ -92,7 +113,7 @@ def process(
             frames = stack.enter_context(open_recording(recording, topic))
             _claim(output, force)
             writer = stack.enter_context(ResultWriter(output))
-            _process(frames, Pipeline(parameters), writer, totals)
+            _process(frames, Pipeline(parameters), writer, totals, live)
     except (RecordingError, OSError) as error:
         _fail(error)
     except KeyboardInterrupt:
@@ -100,46 +121,116 @@ def process(
         sys.exit(130)
     if not totals.frames:
         _fail(f"no frame of {recording} could be processed")
-    click.echo(f"{totals}; {DETECTIONS} and {STAR_FIELD} are in {output}")
+    click.echo(f"{totals}; {DETECTIONS}, {TRACKS} and {STAR_FIELD} are in {output}")
 
 
 class _Totals:
     """Counts for the summary."""
 
     def __init__(self) -> None:
-        self.frames = self.detections = self.left_out = 0
+        self.frames = self.detections = self.candidates = self.left_out = 0
+        self.tracks: set[int] = set()
         self.reason = ""
 
+    def count(self, detections: NDArray[np.void]) -> None:
+        """Add the detections of one frame."""
+        confirmed = detections["status"] == CONFIRMED
+        self.tracks.update(detections["track_id"][confirmed].tolist())
+        self.detections += int(confirmed.sum())
+        self.candidates += int((~confirmed).sum())
+
     def __str__(self) -> str:
-        words = f"{self.detections} RSO detections in {self.frames} frames"
+        words = f"{self.detections + self.candidates} RSO detections in {self.frames} frames"
         if self.left_out:
             words += f" ({self.left_out} more could not be processed)"
-        if not self.detections and self.reason:
+        if self.tracks:
+            words += f", of {len(self.tracks)} tracks"
+            if self.candidates:
+                words += f" and {self.candidates} candidates"
+        if not (self.detections or self.candidates) and self.reason:
             words += f"; the last frame says: {self.reason}"
         return words
 
 
-def _process(frames: Recording, pipeline: Pipeline, writer: ResultWriter, totals: _Totals) -> None:
+def _process(
+    frames: Recording, pipeline: Pipeline, writer: ResultWriter, totals: _Totals, live: bool
+) -> None:
     refused = 0
-    for given, frame in enumerate(tqdm(frames, unit=" frames", dynamic_ncols=True, disable=None)):
-        # Its number in the recording, which counts those that could not be decoded.
-        number = given + frames.skipped
-        try:
-            result = pipeline.process(frame.image, frame.stamp_ns)
-        except ImageError as error:
-            refused += 1
-            if refused == 1:
-                _say(f"note: frame {number} is left out, and others like it: {error}")
-            continue
-        if result.reset and totals.frames:
-            _say(f"note: frame {number} starts afresh: {result.reset}")
-        writer.add(replace(result, frame=number))
-        totals.frames += 1
-        totals.detections += len(result.detections)
-        totals.reason = result.reason
+    # Numbers in the recording, which count those that could not be decoded, by the pipeline's.
+    numbers: dict[int, int] = {}
+
+    def write(stamp_ns: int, frame: int, detections: NDArray[np.void]) -> None:
+        writer.add_detections(stamp_ns, frame, detections)
+        totals.count(detections)
+
+    def write_settled(settled: list[Settled]) -> None:
+        for last in settled:
+            number = numbers.pop(last.frame)
+            if not live:
+                write(last.stamp_ns, number, last.detections)
+
+    try:
+        for given, frame in enumerate(
+            tqdm(frames, unit=" frames", dynamic_ncols=True, disable=None)
+        ):
+            number = given + frames.skipped
+            try:
+                result = pipeline.process(frame.image, frame.stamp_ns)
+            except ImageError as error:
+                refused += 1
+                if refused == 1:
+                    _say(f"note: frame {number} is left out, and others like it: {error}")
+                continue
+            if result.reset and totals.frames:
+                _say(f"note: frame {number} starts afresh: {result.reset}")
+            numbers[result.frame] = number
+            writer.add_star_field(replace(result, frame=number))
+            if live:
+                write(result.stamp_ns, number, result.detections)
+            write_settled(result.settled)
+            totals.frames += 1
+            totals.reason = result.reason
+    finally:
+        # Also when stopped or torn off: what was seen is not lost.
+        write_settled(pipeline.finish())
     totals.left_out = refused + frames.skipped
     for problem in frames.problems:
         _say(f"note: {problem}")
+
+
+@main.command()
+@click.argument("results", type=click.Path(path_type=Path))
+@click.argument("truth", type=click.Path(dir_okay=False, path_type=Path))
+@click.option(
+    "--live", is_flag=True, help="count only what the node could know: from the third frame on"
+)
+@click.option("--candidates", is_flag=True, help="count unconfirmed detections too")
+@click.option("--json", "as_json", is_flag=True, help="print JSON instead of a table")
+@click.option("--list", "listed", is_flag=True, help="also list every miss and false alarm")
+def evaluate(
+    results: Path, truth: Path, live: bool, candidates: bool, as_json: bool, listed: bool
+) -> None:
+    """Compare RESULTS, a folder made by process, with the file TRUTH.
+
+    Recall by SNR, precision, false alarms per frame, errors of position and velocity.
+    """
+    try:
+        evaluation = evaluate_detections(
+            read_truth(truth),
+            read_detections(results),
+            frames=count_frames(results),
+            live=live,
+            candidates=candidates,
+        )
+    except (EvaluationError, OSError) as error:
+        _fail(error)
+    if as_json:
+        click.echo(json.dumps(evaluation.as_dict(), indent=2))
+        return
+    click.echo(str(evaluation))
+    if listed:
+        for row in evaluation.rows("missed", "false alarm"):
+            click.echo(row)
 
 
 @main.command()
@@ -202,10 +293,10 @@ def simulate(
 def _claim(folder: Path, force: bool) -> None:
     """Make the folder for the results, or refuse to overwrite those that it holds."""
     folder.mkdir(parents=True, exist_ok=True)
-    old = [name for name in (DETECTIONS, STAR_FIELD) if (folder / name).exists()]
+    old = [name for name in (DETECTIONS, TRACKS, STAR_FIELD) if (folder / name).exists()]
     if old and not force:
         raise RecordingError(
-            f"{folder} already holds {' and '.join(old)}; choose another folder, or --force to"
+            f"{folder} already holds {', '.join(old)}; choose another folder, or --force to"
             " replace them"
         )
 

@@ -28,6 +28,13 @@ OBJECT_DTYPE = np.dtype(
     ]
 )
 
+# A second peak of a region is an object of its own if it stands this far over the valley between
+# them: in sigmas, and in parts of itself.
+_PROMINENCE_SIGMAS, _PROMINENCE_RATIO = 5.0, 0.3
+# Levels at which a valley is looked for, and peaks of a region that are looked at.
+_LEVEL_STEP, _MOST_PEAKS = 1.25, 20
+_AROUND = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0)]
+
 
 def find_objects(
     image: NDArray[np.float32],
@@ -79,7 +86,14 @@ def find_objects(
         return np.zeros(0, OBJECT_DTYPE), labels
     count, regions = cv2.connectedComponents(mask, connectivity=8, ltype=cv2.CV_32S)
     x, y = inside.reshape(-1, 2).T.astype(np.intp)
-    region = regions[y, x] - 1
+    count = _split(regions, count, x, y, smoothed, noise)
+    # What lies between the parts of a split region belongs to none.
+    x, y = x[regions[y, x] > 0], y[regions[y, x] > 0]
+    # A part may be left without a pixel.
+    region = regions[y, x]
+    present = np.bincount(region, minlength=count) > 0
+    region = (np.cumsum(present) - 1)[region]
+    count = int(np.count_nonzero(present)) + 1
     moments = _moments(region, count - 1, x, y, smoothed[y, x].astype(np.float64), noise)
 
     def total(weights: NDArray[np.generic] | None = None) -> NDArray[np.float64]:
@@ -107,6 +121,85 @@ def find_objects(
     rank[order] = np.arange(1, order.size + 1)
     labels[y, x] = rank[region]
     return objects[order], labels
+
+
+def _split(
+    regions: NDArray[np.int32],
+    count: int,
+    x: NDArray[np.intp],
+    y: NDArray[np.intp],
+    smoothed: NDArray[np.float32],
+    noise: float,
+) -> int:
+    """Split, in place, regions of several bright peaks into one for each; return the new count.
+
+    A faint object in a bright one's wings is in the same region, but the way between their peaks
+    leads through a valley.
+    """
+    height, width = smoothed.shape
+    bright = smoothed[y, x] > 2 * _PROMINENCE_SIGMAS * noise
+    px, py = x[bright], y[bright]
+    for dy, dx in _AROUND:
+        beside = smoothed[np.clip(py + dy, 0, height - 1), np.clip(px + dx, 0, width - 1)]
+        top = smoothed[py, px] >= beside
+        px, py = px[top], py[top]
+    owner = regions[py, px]
+    several = np.flatnonzero(np.bincount(owner, minlength=count) > 1)
+    several = several[several > 0]
+    if not several.size:
+        return count
+    # The region's box, from its pixels in order.
+    mine = np.isin(regions[y, x], several)
+    mx, my, mr = x[mine], y[mine], regions[y[mine], x[mine]]
+    order = np.argsort(mr, kind="stable")
+    starts = np.searchsorted(mr[order], several)
+    ends = np.searchsorted(mr[order], several, side="right")
+    for label, start, end in zip(several, starts, ends, strict=True):
+        rows = order[start:end]
+        left, top_row = mx[rows].min(), my[rows].min()
+        box = np.s_[top_row : my[rows].max() + 1, left : mx[rows].max() + 1]
+        own = regions[box] == label
+        peaks = np.flatnonzero(owner == label)
+        peaks = peaks[np.argsort(-smoothed[py[peaks], px[peaks]])][:_MOST_PEAKS]
+        places = np.stack([py[peaks] - top_row, px[peaks] - left], axis=1)
+        parts = _parts(np.where(own, smoothed[box], 0), places, noise)
+        if parts is None:
+            continue
+        for part in range(1, parts.max() + 1):
+            regions[box][parts == part] = label if part == 1 else count
+            count += part > 1
+        regions[box][own & (parts == 0)] = 0
+    return count
+
+
+def _parts(
+    light: NDArray[np.float32], peaks: NDArray[np.intp], noise: float
+) -> NDArray[np.int32] | None:
+    """Part of a region that each pixel belongs to, from 1, and 0 between them.
+
+    None if no second of its peaks, (P, 2) rows and columns, the brightest first, stands out.
+    """
+    height = light[peaks[:, 0], peaks[:, 1]]
+    alive = np.ones(len(peaks), bool)
+    valley = np.zeros(len(peaks))
+    level = float(height[1]) / _LEVEL_STEP
+    while level > _PROMINENCE_SIGMAS * noise and not valley[1:].all():
+        _, labels = cv2.connectedComponents((light > level).astype(np.uint8), connectivity=8)
+        at = labels[peaks[:, 0], peaks[:, 1]]
+        for fainter in np.flatnonzero((height > level) & (valley == 0)):
+            if fainter and np.any(at[:fainter] == at[fainter]):
+                valley[fainter] = level
+                needed = max(_PROMINENCE_SIGMAS * noise, _PROMINENCE_RATIO * height[fainter])
+                alive[fainter] = height[fainter] - level > needed
+        level /= _LEVEL_STEP
+    if np.count_nonzero(alive) < 2:
+        return None
+    markers = np.where(light > 0, 0, len(peaks) + 1).astype(np.int32)
+    for part, (row, column) in enumerate(peaks[alive], start=1):
+        markers[row, column] = part
+    grey = 255 * (1 - np.log1p(light / noise) / np.log1p(height[0] / noise))
+    flood = cv2.watershed(np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2), markers)
+    return np.where((flood > 0) & (flood <= len(peaks)), flood, 0)
 
 
 def _moments(

@@ -303,13 +303,28 @@ class Parameters(Table):
         "a velocity further than this many std from the mean is left out, model mean",
     )
     rso_test: str = _choice(
-        "vector speed",
+        "history vector speed",
         "detection",
-        "vector: an RSO's velocity differs from the fitted star field by more than its"
-        " uncertainty; speed: its speed lies outside mean +- k std, as published",
+        "history: an RSO shines where the last frames show no star, or drifts, along a path that"
+        " chance does not explain; vector: its velocity differs from the star field's by more than"
+        " its uncertainty, two frames alone; speed: its speed lies outside mean +- k std, as"
+        " published",
     )
     rso_sigmas: float = _number(
-        6.0, 0.5, 100.0, "", "detection", "k of the RSO test, in sigmas of the vector or the speed"
+        6.0,
+        0.5,
+        100.0,
+        "",
+        "detection",
+        "k of the RSO test, in sigmas of the vector or the speed; tests vector and speed",
+    )
+    spot_sigmas: float = _number(
+        3.0,
+        1.0,
+        100.0,
+        "",
+        "detection",
+        "least brightness over the star field's of what may be an RSO, in sigmas; test history",
     )
     min_relative_px: float = _number(
         0.3,
@@ -318,6 +333,28 @@ class Parameters(Table):
         "px",
         "detection",
         "least displacement per frame against the star field, test vector",
+    )
+    history_frames: int = _number(
+        9,
+        3,
+        100,
+        "frames",
+        "tracking",
+        "frames that are compared, the current one included; more finds slower and fainter RSOs",
+    )
+    false_tracks: float = _number(
+        1e-3,
+        1e-12,
+        1.0,
+        "",
+        "tracking",
+        "a track is confirmed when chance gives fewer such tracks than this in a frame",
+    )
+    max_speed_px: float = _number(
+        150.0, 1.0, 10000.0, "px", "tracking", "fastest motion against the stars, per frame"
+    )
+    coast_frames: int = _number(
+        5, 0, 1000, "frames", "tracking", "a track unseen in more frames in a row ends"
     )
     max_gap_s: float = _number(
         600.0, 0.001, 1e6, "s", "pipeline", "a longer time between two frames starts afresh"

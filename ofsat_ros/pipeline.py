@@ -1,4 +1,4 @@
-"""The pipeline: the order of the stages, and the previous frame.
+"""The pipeline: the order of the stages, and what is kept of the frames before.
 
 The one place that knows all stages.  Live nodes and offline commands feed it one image at a time
 and get a `FrameResult`; what is different between them lies outside.
@@ -10,19 +10,33 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ofsat_ros.detection import DETECTION_DTYPE, detect
+from ofsat_ros.detection import (
+    DETECTION_DTYPE,
+    detect,
+    find_drifting,
+    find_spots,
+    refine,
+    spot_near,
+)
+from ofsat_ros.history import History, PastFrame
 from ofsat_ros.objects import OBJECT_DTYPE, find_objects
 from ofsat_ros.optical_flow import Flow, FlowInput, flow_engine
 from ofsat_ros.parameters import Parameters
-from ofsat_ros.preprocessing import preprocess
+from ofsat_ros.preprocessing import Preprocessed, SensorMemory, preprocess
 from ofsat_ros.star_field import StarFieldMotion, estimate_motion, vote_shift
+from ofsat_ros.tracking import TRACK_DTYPE, Settled, Tracker
 
 _SMALLEST_SIDE = 16
 _DTYPES = ("uint8", "uint16", "float32")
+# Where a track is expected, a closer look finds what is a spot of this many sigmas, this near, px.
+_CLOSER_SIGMAS, _CLOSER_PX = 2.0, 2
+# Frames in a row over which the field's motion is taken to go on when no star shows it.
+_BLIND_FRAMES = 3
 # Images that were preprocessed differently cannot be compared.
 _PREPROCESSING = [p.name for p in Parameters.describe() if p.stage == "preprocessing"]
 
@@ -54,7 +68,14 @@ class FrameResult:
     star_field : StarFieldMotion or None
         Motion of the star field; None if it was not found.
     detections : (K,) DETECTION_DTYPE
-        RSO candidates.
+        RSOs in this frame, confirmed ones and candidates.
+    tracks : (N,) TRACK_DTYPE
+        Confirmed tracks, coasting ones included; test history only.
+    settled : list of Settled
+        The last word on frames, in their order, with what later frames taught: the look back.
+        Without test history, of this frame.
+    spot_count : int
+        Spots that are not the star field's: RSOs, noise, cosmic rays, defects.
     background, noise, threshold : float
         Median level of the background, std of the smoothed background, threshold over the
         background, DN.
@@ -73,6 +94,9 @@ class FrameResult:
     flow: Flow = field(default_factory=Flow.empty)
     star_field: StarFieldMotion | None = None
     detections: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, DETECTION_DTYPE))
+    tracks: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, TRACK_DTYPE))
+    settled: list[Settled] = field(default_factory=list)
+    spot_count: int = 0
     background: float = float("nan")
     noise: float = float("nan")
     threshold: float = float("nan")
@@ -84,8 +108,10 @@ class FrameResult:
         """Rows of the flow that are stars': they move with the field and are no detection's."""
         if self.star_field is None:
             return np.zeros(0, np.intp)
-        rows = np.flatnonzero(self.star_field.inliers)
-        return np.setdiff1d(rows, self.detections["flow_index"])
+        own = self.detections["object_index"]
+        of_rso = np.isin(self.flow.object_index, own[own >= 0])
+        of_rso[self.detections["flow_index"][self.detections["flow_index"] >= 0]] = True
+        return np.flatnonzero(self.star_field.inliers & ~of_rso)
 
 
 @dataclass(frozen=True)
@@ -119,13 +145,33 @@ class Pipeline:
     def __init__(self, parameters: Parameters | None = None) -> None:
         self.parameters = parameters or Parameters.preset()
         self._previous: _Previous | None = None
+        self._sensor = SensorMemory()
+        self._history = History(self.parameters.history_frames)
+        look = partial(spot_near, radius_px=_CLOSER_PX, least_sigmas=_CLOSER_SIGMAS)
+        self._tracker = Tracker(look, refine)
+        self._settled: list[Settled] = []
+        self._last_motion: StarFieldMotion | None = None
+        self._blind = 0
         self._reset_reason = "first frame"
         self._frames = 0
 
     def reset(self, reason: str = "reset asked for") -> None:
-        """Forget the previous frame; the next one starts afresh and gives `reason`."""
+        """Forget all frames and end all tracks; the next frame starts afresh and says `reason`."""
         self._previous = None
+        self._forget()
         self._reset_reason = reason
+
+    def finish(self) -> list[Settled]:
+        """Say the last word on the frames that it was not said of yet, and start afresh."""
+        self.reset("finished")
+        settled, self._settled = self._settled, []
+        return settled
+
+    def _forget(self) -> None:
+        """End all tracks and drop the history; the last word on it goes with the next frame."""
+        self._settled += self._tracker.clear(self._history)
+        self._history.clear()
+        self._last_motion = None
 
     def process(self, image: NDArray[np.generic], stamp_ns: int) -> FrameResult:
         """Process the next image.
@@ -152,7 +198,7 @@ class Pipeline:
         result = FrameResult(stamp_ns, self._frames, (image.shape[0], image.shape[1]))
         with _timed(result.seconds, "preprocessing"):
             try:
-                pre = preprocess(image, parameters)
+                pre = preprocess(image, parameters, self._sensor)
             except ValueError as error:
                 raise ImageError(str(error)) from error
         self._frames += 1
@@ -183,6 +229,12 @@ class Pipeline:
         if previous is not None:
             result.dt_s = (stamp_ns - previous.stamp_ns) / 1e9
             self._compare(previous, current, result, parameters)
+        if parameters.rso_test == "history":
+            self._remember(pre, labels, result, parameters)
+            self._track(pre.defects, result, parameters)
+        else:
+            self._settled.append(Settled(result.frame, stamp_ns, result.detections))
+        result.settled, self._settled = self._settled, []
         self._previous = _Previous(stamp_ns, image.dtype, parameters, result.objects, current)
         result.reason = _why_nothing(result)
         return result
@@ -254,6 +306,8 @@ class Pipeline:
         inliers = np.zeros(len(flow), bool)
         inliers[valid] = motion.inliers
         result.star_field = motion.with_inliers(inliers)
+        if parameters.rso_test == "history":
+            return
         with _timed(result.seconds, "detection"):
             result.detections = detect(
                 result.objects,
@@ -266,6 +320,66 @@ class Pipeline:
                 parameters.rso_sigmas,
                 parameters.min_relative_px,
             )
+
+    def _remember(
+        self,
+        pre: Preprocessed,
+        labels: NDArray[np.int32],
+        result: FrameResult,
+        parameters: Parameters,
+    ) -> None:
+        """Add the frame to the history, at its place on the sky."""
+        if parameters.history_frames != self._history.length:
+            old, self._history = self._history, History(parameters.history_frames)
+            for frame in old:
+                self._history.add(frame)
+        motion = result.star_field
+        self._blind = 0 if motion is not None else self._blind + 1
+        if self._blind > _BLIND_FRAMES:
+            # Where the stars went meanwhile is not known: what follows is another sky.
+            self._forget()
+        self._last_motion = motion or self._last_motion
+        to_sky = self._history.place(self._last_motion)
+        self._history.add(
+            PastFrame(
+                number=result.frame,
+                stamp_ns=result.stamp_ns,
+                image=pre.image,
+                smoothed=pre.smoothed,
+                noise=pre.noise,
+                noise_ratio=pre.noise_ratio,
+                objects=result.objects,
+                labels=labels,
+                to_sky=to_sky,
+            )
+        )
+
+    def _track(self, defects: int, result: FrameResult, parameters: Parameters) -> None:
+        """Fill in detections and tracks from the history."""
+        history = self._history
+        if len(history) < 2:
+            return
+        # The first frame has no other to compare it with until the second is there.
+        fresh = list(history)[-2:] if len(history) == 2 else [history[-1]]
+        log_limit = float(np.log(parameters.false_tracks))
+        with _timed(result.seconds, "detection"):
+            spots = [
+                find_spots(frame, history.others(frame), parameters.spot_sigmas) for frame in fresh
+            ]
+            drifts = find_drifting(history, log_limit)
+        result.spot_count = len(spots[-1])
+        with _timed(result.seconds, "tracking"):
+            tracked = self._tracker.update(
+                history,
+                spots,
+                drifts,
+                defects,
+                log_limit,
+                parameters.max_speed_px,
+                parameters.coast_frames,
+            )
+        result.detections, result.tracks = tracked.detections, tracked.tracks
+        self._settled += tracked.settled
 
 
 def _check(image: NDArray[np.generic]) -> None:
@@ -306,4 +420,11 @@ def _why_nothing(result: FrameResult) -> str:
         return f"the {valid} flow vectors do not agree on a motion of the star field"
     if valid == 1:
         return "only one object was found in the previous frame: no star field to compare it with"
-    return f"everything moves with the star field ({result.star_field.star_count} stars)"
+    stars = result.star_field.star_count
+    if not result.spot_count:
+        return f"everything moves with the star field ({stars} stars)"
+    coasting = f"; {len(result.tracks)} tracks coast" if len(result.tracks) else ""
+    return (
+        f"{stars} stars; none of {result.spot_count} spots beside them lies on a path that noise"
+        f" would not explain{coasting}"
+    )

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ofsat_ros.parameters import Parameters
 
 Image = NDArray[np.float32]
+Index = NDArray[np.intp]
 
 # Samples per side of a mesh cell: 1,024 values give its level to 4 % of the noise.
 _SAMPLES = 32
@@ -28,6 +29,14 @@ _LARGEST = 1e15
 # anywhere on the pixel grid); a defect's neighbours hold noise.
 _DEFECT_RATIO = 0.25
 _DEFECT_SIGMAS = 6.0
+_NONE = np.zeros(0, np.intp)
+_AROUND = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0)]
+# Smoothed by 1 px, a star keeps this fraction of its peak at least, one or two pixels alone 0.26
+# at most; and it keeps what the others keep, less what noise and their shape may change.
+_LEAST_KEPT, _KEPT_RATIO = 0.3, 0.7
+_KEPT_SIGMAS = 20.0
+# Frames over which the sensor's fixed pattern is averaged at most.
+_MEMORY_FRAMES = 100
 
 
 @dataclass(frozen=True)
@@ -53,6 +62,8 @@ class Preprocessed:
         Noise over its median, on a mesh of equal cells; one cell when it is not local.
     threshold : float
         Threshold of `smoothed`, over the background, DN; the median over the image.
+    defects : int
+        Pixels that the sensor's memory knows as defects.
     """
 
     image: Image
@@ -64,9 +75,53 @@ class Preprocessed:
     noise: float
     noise_ratio: Image
     threshold: float
+    defects: int
 
 
-def preprocess(raw: NDArray[np.generic], parameters: Parameters) -> Preprocessed:
+class SensorMemory:
+    """What the sensor shows in every frame: the mean of its images less their background.
+
+    A defect too faint for one frame, or one of a few pixels, stands out in the mean: it keeps less
+    of its peak when smoothed than the stars do, which are as wide as the optics make a point.
+    """
+
+    def __init__(self) -> None:
+        self._mean: Image | None = None
+        self._count = 0
+
+    def defects(self, image: Image, noise: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Add an image and return the rows and columns of the defects that the mean shows.
+
+        Parameters
+        ----------
+        image : (H, W) float32
+            Image less its background, DN.  One of another size than before starts afresh.
+        noise : float
+            Std of its background, DN.
+        """
+        if self._mean is None or self._mean.shape != image.shape:
+            self._mean, self._count = np.zeros_like(image), 0
+        self._count = min(self._count + 1, _MEMORY_FRAMES)
+        cv2.accumulateWeighted(image, self._mean, 1 / self._count)
+        stars = _kept(image, *_peaks(image, _KEPT_SIGMAS * noise))
+        # Squared: a streak is smoothed along one axis only, a point along both.
+        usual = float(np.median(stars)) ** 2 if stars.size else 0.0
+        limit = _DEFECT_SIGMAS * noise / math.sqrt(self._count)
+        y, x = _peaks(self._mean, limit)
+        sharp = _kept(self._mean, y, x) < max(_LEAST_KEPT, _KEPT_RATIO * usual)
+        y, x = y[sharp], x[sharp]
+        # Its neighbours too, where its charge has leaked to.
+        parts = [
+            (self._mean[ny, nx] > limit, ny, nx)
+            for ny, nx in (_beside(self._mean.shape, y, x, step) for step in [(0, 0), *_AROUND])
+        ]
+        rows = np.concatenate([ny[part] for part, ny, _ in parts])
+        return rows, np.concatenate([nx[part] for part, _, nx in parts])
+
+
+def preprocess(
+    raw: NDArray[np.generic], parameters: Parameters, memory: SensorMemory | None = None
+) -> Preprocessed:
     """Subtract the background, smooth and threshold one image.
 
     Parameters
@@ -75,6 +130,8 @@ def preprocess(raw: NDArray[np.generic], parameters: Parameters) -> Preprocessed
         The image, DN.  Values that are not finite, or beyond 1e15, count as background.
     parameters : Parameters
         Those of the stage ``preprocessing``.
+    memory : SensorMemory, optional
+        What was learned of the sensor from the images before; this one is added to it.
 
     Returns
     -------
@@ -97,8 +154,13 @@ def preprocess(raw: NDArray[np.generic], parameters: Parameters) -> Preprocessed
     # Of what is left: a gradient inside a cell is no noise.
     coarse = (min(mesh[0], _NOISE_CELLS), min(mesh[1], _NOISE_CELLS))
     pixel_noise = float(np.median(_mesh_statistics(image, coarse, rounding)[1]))
+    defects = 0
     if parameters.hot_pixels == "replace":
-        _replace_defects(image, pixel_noise)
+        known = memory.defects(image, pixel_noise) if memory else (_NONE, _NONE)
+        defects = len(known[0])
+        for y, x in (_sharp_pixels(image, pixel_noise), known):
+            around = [image[_beside(image.shape, y, x, step)] for step in _AROUND]
+            image[y, x] = np.median(around, axis=0)
 
     sigma = parameters.smoothing_sigma_px
     smoothed = cv2.GaussianBlur(image, (0, 0), sigma) if sigma > 0 else image.copy()
@@ -127,6 +189,7 @@ def preprocess(raw: NDArray[np.generic], parameters: Parameters) -> Preprocessed
         noise=noise,
         noise_ratio=ratio,
         threshold=threshold,
+        defects=defects,
     )
 
 
@@ -229,25 +292,53 @@ def _stretch_mesh(mesh: Image, shape: tuple[int, ...]) -> Image:
     return cv2.resize(mesh, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
 
 
-def _replace_defects(image: Image, noise: float) -> None:
-    """Replace, in place, pixels that stand alone too sharply to be an image of a star."""
-    bright = cv2.findNonZero(cv2.compare(image, _DEFECT_SIGMAS * noise, cv2.CMP_GT))
-    if bright is None:
-        return
-    x, y = bright.reshape(-1, 2).T
-
-    def beside(dy: int, dx: int) -> Image:
-        return image[_mirrored(y + dy, image.shape[0]), _mirrored(x + dx, image.shape[1])]
-
-    steps = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0)]
-    for step in steps:
+def _sharp_pixels(image: Image, noise: float) -> tuple[Index, Index]:
+    """Rows and columns of pixels that stand alone too sharply to be an image of a star."""
+    y, x = _brighter(image, _DEFECT_SIGMAS * noise)
+    for step in _AROUND:
         # One by one, since few are left after the first.
-        alone = beside(*step) < _DEFECT_RATIO * image[y, x]
+        alone = image[_beside(image.shape, y, x, step)] < _DEFECT_RATIO * image[y, x]
         y, x = y[alone], x[alone]
-    image[y, x] = np.median([beside(*step) for step in steps], axis=0)
+    return y, x
 
 
-def _mirrored(index: NDArray[np.integer], size: int) -> NDArray[np.integer]:
-    """Indices of which those one step outside are mirrored at the border."""
+def _peaks(image: Image, limit: float) -> tuple[Index, Index]:
+    """Rows and columns of the local maxima above a limit."""
+    y, x = _brighter(image, limit)
+    for step in _AROUND:
+        highest = image[_beside(image.shape, y, x, step)] <= image[y, x]
+        y, x = y[highest], x[highest]
+    return y, x
+
+
+def _kept(image: Image, y: Index, x: Index) -> NDArray[np.float64]:
+    """What pixels keep of their value when smoothed by a Gaussian of 1 px, (N,)."""
+    line = cv2.getGaussianKernel(7, 1.0).ravel()
+    smoothed = np.zeros(len(y))
+    for dy in range(-3, 4):
+        for dx in range(-3, 4):
+            place = _beside(image.shape, y, x, (dy, dx))
+            smoothed += line[dy + 3] * line[dx + 3] * image[place]
+    return smoothed / image[y, x]
+
+
+def _brighter(image: Image, limit: float) -> tuple[Index, Index]:
+    """Rows and columns of the pixels above a limit."""
+    bright = cv2.findNonZero(cv2.compare(image, limit, cv2.CMP_GT))
+    if bright is None:
+        return _NONE, _NONE
+    x, y = bright.reshape(-1, 2).astype(np.intp).T
+    return y, x
+
+
+def _beside(
+    shape: tuple[int, ...], y: Index, x: Index, step: tuple[int, int]
+) -> tuple[Index, Index]:
+    """Rows and columns of the pixels one step from others."""
+    return _mirrored(y + step[0], shape[0]), _mirrored(x + step[1], shape[1])
+
+
+def _mirrored(index: Index, size: int) -> Index:
+    """Indices of which those a few steps outside are mirrored at the border."""
     last = size - 1
     return last - np.abs(last - np.abs(index))

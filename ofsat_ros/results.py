@@ -1,4 +1,4 @@
-"""Result files: the columns of ``detections.csv`` and ``star_field.csv``, and their writer.
+"""Result files: the columns of ``detections.csv``, ``tracks.csv`` and ``star_field.csv``.
 
 Stands after the pipeline: the command ``ofsat process`` and the recorder node write through here,
 so that a file reads the same whoever made it.  Times are int ns UTC, angles in deg, unknown is
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ofsat_ros.detection import CONFIRMED
 from ofsat_ros.pipeline import FrameResult
 
-DETECTIONS, STAR_FIELD = "detections.csv", "star_field.csv"
+DETECTIONS, TRACKS, STAR_FIELD = "detections.csv", "tracks.csv", "star_field.csv"
 
 DETECTION_COLUMNS = (
     "stamp_ns",
@@ -40,6 +40,25 @@ DETECTION_COLUMNS = (
     "angle_deg",
     "ra_deg",
     "dec_deg",
+)
+TRACK_COLUMNS = (
+    "track_id",
+    "first_stamp_ns",
+    "last_stamp_ns",
+    "first_frame",
+    "last_frame",
+    "detections",
+    "first_x_px",
+    "first_y_px",
+    "last_x_px",
+    "last_y_px",
+    "vx_px_s",
+    "vy_px_s",
+    "rel_vx_px_s",
+    "rel_vy_px_s",
+    "snr",
+    "flux",
+    "length_px",
 )
 STAR_FIELD_COLUMNS = (
     "stamp_ns",
@@ -94,7 +113,8 @@ def detection_lines(stamp_ns: int, frame: int, detections: NDArray[np.void]) -> 
 class ResultWriter:
     """Writes a folder of results, frame by frame; a context manager.
 
-    What is written is on disk at the end of each frame, so that it survives whatever comes next.
+    What is written is on disk at the end of each frame, so that it survives whatever comes next;
+    ``tracks.csv``, which sums up the tracks of the detections, is written by `close`.
 
     Parameters
     ----------
@@ -108,20 +128,30 @@ class ResultWriter:
     """
 
     def __init__(self, folder: Path) -> None:
+        self._tracks: dict[int, _TrackSummary] = {}
         with ExitStack() as files:
             self._detections = files.enter_context(_start(folder / DETECTIONS, DETECTION_COLUMNS))
+            self._track_file = files.enter_context(_start(folder / TRACKS, TRACK_COLUMNS))
             self._star_field = files.enter_context(_start(folder / STAR_FIELD, STAR_FIELD_COLUMNS))
             self._files = files.pop_all()
 
-    def add(self, result: FrameResult) -> None:
-        """Write what one frame gave."""
-        lines = detection_lines(result.stamp_ns, result.frame, result.detections)
+    def add_detections(self, stamp_ns: int, frame: int, detections: NDArray[np.void]) -> None:
+        """Write the detections (DETECTION_DTYPE) of one frame; frames come in their order."""
         # One write: Ctrl-C leaves no part of a line.
-        self._detections.write("".join(lines))
+        self._detections.write("".join(detection_lines(stamp_ns, frame, detections)))
+        for row in detections[detections["track_id"] > 0]:
+            track = self._tracks.setdefault(int(row["track_id"]), _TrackSummary())
+            track.add(stamp_ns, frame, row)
+
+    def add_star_field(self, result: FrameResult) -> None:
+        """Write the star field's motion in one frame."""
         self._star_field.write(_star_field_line(result))
 
     def close(self) -> None:
-        """Close the files."""
+        """Write the tracks and close the files."""
+        if not self._track_file.closed:
+            lines = [track.line(number) for number, track in sorted(self._tracks.items())]
+            self._track_file.write("".join(lines))
         self._files.close()
 
     def __enter__(self) -> Self:
@@ -134,6 +164,27 @@ class ResultWriter:
         traceback: TracebackType | None,
     ) -> None:
         self.close()
+
+
+class _TrackSummary:
+    """One track's detections, summed up."""
+
+    def __init__(self) -> None:
+        self._frames: list[tuple[int, int]] = []
+        self._rows: list[np.void] = []
+
+    def add(self, stamp_ns: int, frame: int, row: np.void) -> None:
+        self._frames.append((stamp_ns, frame))
+        self._rows.append(row)
+
+    def line(self, track_id: int) -> str:
+        """Its line of ``tracks.csv``: mean velocities, median brightness and length."""
+        rows = np.array(self._rows, self._rows[0].dtype)
+        (first_stamp, first), (last_stamp, last) = self._frames[0], self._frames[-1]
+        numbers = [rows[name][i] for i in (0, -1) for name in ("x", "y")]
+        numbers += [float(rows[name].mean()) for name in ("vx", "vy", "rel_vx", "rel_vy")]
+        numbers += [float(np.median(rows[name])) for name in ("snr", "flux", "length")]
+        return _line([track_id, first_stamp, last_stamp, first, last, len(rows)], numbers)
 
 
 def _star_field_line(result: FrameResult) -> str:

@@ -1,6 +1,7 @@
 """The ``ofsat`` command: files, words, exit codes, and what it finds in simulated recordings."""
 
 import csv
+import json
 import os
 import re
 import signal
@@ -15,6 +16,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 import ofsat_ros
+from ofsat_ros import evaluation
 from ofsat_ros.cli import main
 from ofsat_ros.parameters import Parameters, preset_names
 from ofsat_ros.pipeline import Pipeline
@@ -136,7 +138,10 @@ def test_simulate_does_not_replace_a_bag_unless_told(tmp_path: Path):
         (("--frames", 0), "frames must be an integer within 1 to 1e+07, not 0"),
         (("--seed", -1), "seed must be an integer within 0 to 2.14748e+09, not -1"),
         (("--bit-depth", 17), "17 is not in the range 8<=x<=16"),
-        (("--scenario", "leo"), "'leo' is not one of 'geo', 'sidereal', 'survey', 'empty'"),
+        (
+            ("--scenario", "leo"),
+            "'leo' is not one of 'geo', 'sidereal', 'survey', 'empty', 'fast'",
+        ),
         (("--storage", "ros1"), "'ros1' is not one of 'mcap', 'sqlite3'"),
     ],
 )
@@ -153,36 +158,87 @@ def test_simulate_in_the_current_folder_is_refused_in_words(tmp_path: Path, monk
 # Process: files and words
 
 
-def test_process_writes_what_the_pipeline_gives(small: Path, tmp_path: Path):
+def run_pipeline(bag: Path, parameters: Parameters | None = None) -> tuple[list, list]:
+    """What the pipeline says at each frame of a bag, and at last."""
+    pipeline = Pipeline(parameters)
+    with open_recording(bag) as recording:
+        results = [pipeline.process(frame.image, frame.stamp_ns) for frame in recording]
+    settled = [last for result in results for last in result.settled] + pipeline.finish()
+    return results, settled
+
+
+def test_process_writes_the_pipelines_last_word(small: Path, tmp_path: Path):
     done = succeeds("process", small, "-o", tmp_path / "new" / "results")
-    pipeline = Pipeline()
-    with open_recording(small) as recording:
-        expected = [pipeline.process(frame.image, frame.stamp_ns) for frame in recording]
+    results, settled = run_pipeline(small)
     rows = read(tmp_path / "new/results/detections.csv")
-    found = [(result, row) for result in expected for row in result.detections]
-    assert len(rows) == len(found) > 10
-    for row, (result, detection) in zip(rows, found, strict=True):
+    found = [(last, row) for last in settled for row in last.detections]
+    assert len(rows) == len(found) > sum(len(result.detections) for result in results) > 10
+    for row, (last, detection) in zip(rows, found, strict=True):
         assert tuple(row) == DETECTION_COLUMNS
-        assert (int(row["stamp_ns"]), int(row["frame"])) == (result.stamp_ns, result.frame)
+        assert (int(row["stamp_ns"]), int(row["frame"])) == (last.stamp_ns, last.frame)
+        assert (int(row["track_id"]), row["confirmed"]) == (detection["track_id"], "1")
         assert float(row["x_px"]) == pytest.approx(detection["x"], rel=1e-8)
         assert float(row["rel_vy_px_s"]) == pytest.approx(detection["rel_vy"], rel=1e-8)
+    tracks = read(tmp_path / "new/results/tracks.csv")
+    assert [int(track["track_id"]) for track in tracks] == sorted(
+        {int(r["track_id"]) for r in rows}
+    )
+    assert sum(int(track["detections"]) for track in tracks) == len(rows)
     rows = read(tmp_path / "new/results/star_field.csv")
     assert tuple(rows[0]) == STAR_FIELD_COLUMNS
     assert [int(row["frame"]) for row in rows] == list(range(6))
     assert rows[0]["note"] == "first frame"
-    for row, result in zip(rows[1:], expected[1:], strict=True):
+    for row, result in zip(rows[1:], results[1:], strict=True):
         assert float(row["dx_px"]) == pytest.approx(result.star_field.displacement[0], rel=1e-8)
     assert done.stdout == (
-        f"{len(found)} RSO detections in 6 frames; detections.csv and star_field.csv are in"
-        f" {tmp_path}/new/results\n"
+        f"{len(found)} RSO detections in 6 frames, of {len(tracks)} tracks;"
+        f" detections.csv, tracks.csv and star_field.csv are in {tmp_path}/new/results\n"
     )
     assert done.stderr == ""
+
+
+def test_process_live_writes_what_the_node_would_say(small: Path, tmp_path: Path):
+    succeeds("process", small, "-o", tmp_path, "--live")
+    results, _ = run_pipeline(small)
+    rows = read(tmp_path / "detections.csv")
+    said = [(result.frame, row) for result in results for row in result.detections]
+    assert [(int(r["frame"]), int(r["track_id"])) for r in rows] == [
+        (frame, row["track_id"]) for frame, row in said
+    ]
+    assert min(int(row["frame"]) for row in rows) == 2  # three frames make a track
+
+
+# Evaluate
+
+
+def test_evaluate_compares_the_results_with_truth(small: Path, tmp_path: Path):
+    succeeds("process", small, "-o", tmp_path)
+    truth = f"{small}.truth.csv"
+    done = succeeds("evaluate", tmp_path, truth, "--json")
+    told = json.loads(done.stdout)
+    direct = evaluation.evaluate(
+        evaluation.read_truth(truth), evaluation.read_detections(tmp_path), frames=6
+    )
+    assert told == json.loads(json.dumps(direct.as_dict()))
+    assert direct.recall(20) > 0.9
+    table = succeeds("evaluate", tmp_path, truth).stdout
+    assert table == f"{direct}\n"
+
+
+def test_evaluate_lists_what_was_missed(small: Path, tmp_path: Path):
+    succeeds("process", small, "-o", tmp_path, "--spot-sigmas", 100, "--threshold-sigmas", 100)
+    done = succeeds("evaluate", tmp_path, f"{small}.truth.csv", "--list")
+    assert done.stdout.count("missed") > 10
+
+
+def test_evaluate_says_what_it_cannot_read(small: Path, tmp_path: Path):
+    assert "detections.csv" in fails(1, "evaluate", tmp_path, f"{small}.truth.csv")
 
 
 def test_process_takes_a_bare_file_and_a_topic(small: Path, tmp_path: Path):
     succeeds("process", small / "small.mcap", "-o", tmp_path / "a", "--topic", TOPIC)
     succeeds("process", small, "-o", tmp_path / "b")
-    for name in ("detections.csv", "star_field.csv"):
+    for name in ("detections.csv", "tracks.csv", "star_field.csv"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
@@ -257,7 +313,7 @@ def test_results_are_not_replaced_unless_told(small: Path, tmp_path: Path):
     succeeds("process", small, "-o", tmp_path, "--preset", "paper_opencv")
     before = (tmp_path / "detections.csv").read_bytes()
     said = fails(1, "process", small, "-o", tmp_path)
-    assert f"ofsat: {tmp_path} already holds detections.csv and star_field.csv" in said
+    assert f"ofsat: {tmp_path} already holds detections.csv, tracks.csv, star_field.csv" in said
     assert "--force" in said
     assert (tmp_path / "detections.csv").read_bytes() == before
     succeeds("process", small, "-o", tmp_path, "--force")
@@ -293,7 +349,7 @@ def test_a_disk_that_is_full_ends_with_a_reason(small: Path, tmp_path: Path, mon
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("ofsat_ros.results.ResultWriter.add", full)
+    monkeypatch.setattr("ofsat_ros.results.ResultWriter.add_star_field", full)
     said = fails(1, "process", small, "-o", tmp_path / "results")
     assert said == "ofsat: No space left on device"
 
@@ -330,7 +386,14 @@ def test_a_frame_that_cannot_be_decoded_is_skipped_and_said(tmp_path: Path):
         START + int(row["frame"]) * 1_000_000_000 for row in rows
     ]
     assert [row["dt_s"] for row in rows] == ["nan", "1", "1", "2", "1", "1"]
-    assert {int(row["frame"]) for row in read(tmp_path / "out/detections.csv")} <= {1, 2, 4, 5, 6}
+    assert {int(row["frame"]) for row in read(tmp_path / "out/detections.csv")} == {
+        0,
+        1,
+        2,
+        4,
+        5,
+        6,
+    }
 
 
 def test_a_frame_that_cannot_be_processed_is_left_out_and_said(tmp_path: Path):
@@ -445,7 +508,7 @@ def test_the_program_keeps_its_two_streams_apart(small: Path, tmp_path: Path):
     done = subprocess_ofsat("process", small, "-o", tmp_path / "out")
     out, err = done.communicate(timeout=60)
     assert done.returncode == 0, err
-    assert re.fullmatch(r"\d+ RSO detections in 6 frames; .*\n", out)
+    assert re.fullmatch(r"\d+ RSO detections in 6 frames, of \d+ tracks; .*\n", out)
     # No progress bar where nobody watches, and no warning.
     assert err == ""
     assert len(read(tmp_path / "out/star_field.csv")) == 6
@@ -464,7 +527,7 @@ def test_the_progress_bar_is_on_standard_error(small: Path, tmp_path: Path):
     shown = os.read(master, 65536).decode()
     os.close(master)
     assert done.returncode == 0
-    assert re.fullmatch(r"\d+ RSO detections in 6 frames; .*\n", done.stdout)
+    assert re.fullmatch(r"\d+ RSO detections in 6 frames, of \d+ tracks; .*\n", done.stdout)
     assert re.search(r"6/6 .* frames", shown)
 
 

@@ -76,12 +76,18 @@ def test_headers_are_the_contract(tmp_path: Path):
     assert (tmp_path / "star_field.csv").read_bytes() == STAR_FIELD.encode() + b"\n"
 
 
+def write(writer: ResultWriter, given: FrameResult) -> None:
+    """Write a frame as `ofsat process` does."""
+    writer.add_star_field(given)
+    writer.add_detections(given.stamp_ns, given.frame, given.detections)
+
+
 def test_detections_make_the_round_trip(tmp_path: Path):
     first, second = detections(3), detections(2)
     with ResultWriter(tmp_path) as writer:
-        writer.add(result(0, detections=first))
-        writer.add(result(1))
-        writer.add(result(2, detections=second))
+        write(writer, result(0, detections=first))
+        write(writer, result(1))
+        write(writer, result(2, detections=second))
     rows = read(tmp_path / "detections.csv")
     assert [int(row["frame"]) for row in rows] == [0, 0, 0, 2, 2]
     for row, found in zip(rows, [*first, *second], strict=True):
@@ -127,7 +133,7 @@ def test_known_values_as_text():
 def test_the_star_field_makes_the_round_trip(tmp_path: Path):
     objects = np.zeros(17, [("x", "f8")])
     with ResultWriter(tmp_path) as writer:
-        writer.add(result(star_field=motion(), objects=objects, detections=detections(2)))
+        write(writer, result(star_field=motion(), objects=objects, detections=detections(2)))
     (row,) = read(tmp_path / "star_field.csv")
     assert row.pop("note") == ""
     assert {name: float(value) for name, value in row.items() if name != "stamp_ns"} == {
@@ -141,12 +147,31 @@ def test_the_star_field_makes_the_round_trip(tmp_path: Path):
     assert row["stamp_ns"] == str(STAMP + 5)
 
 
+def test_tracks_are_summed_up_from_their_detections(tmp_path: Path):
+    first, second = detections(3), detections(3)
+    second["x"], second["snr"], second["vx"] = first["x"] + 5, first["snr"] + 2, first["vx"] + 1
+    with ResultWriter(tmp_path) as writer:
+        write(writer, result(3, detections=first))
+        write(writer, result(4))
+        write(writer, result(5, detections=second[:2]))
+        # The row without a track id, 0, is no track's.
+    rows = read(tmp_path / "tracks.csv")
+    assert [int(row["track_id"]) for row in rows] == [7, 14]
+    one, other = rows
+    assert (one["first_frame"], one["last_frame"], one["detections"]) == ("3", "5", "2")
+    assert int(one["last_stamp_ns"]) - int(one["first_stamp_ns"]) == 2
+    assert float(one["last_x_px"]) - float(one["first_x_px"]) == pytest.approx(5)
+    assert float(one["snr"]) == pytest.approx(first["snr"][1] + 1)
+    assert float(one["vx_px_s"]) == pytest.approx(first["vx"][1] + 0.5)
+    assert (other["first_frame"], other["last_frame"], other["detections"]) == ("3", "3", "1")
+
+
 def test_every_frame_has_its_star_field_line_the_first_too(tmp_path: Path):
     reason = 'no object, "none", is above, alas'
     with ResultWriter(tmp_path) as writer:
-        writer.add(result(0, dt_s=math.nan, reset="first frame", reason="no previous frame"))
-        writer.add(result(1, reason=reason))
-        writer.add(result(2, star_field=motion(), detections=detections(1)))
+        write(writer, result(0, dt_s=math.nan, reset="first frame", reason="no previous frame"))
+        write(writer, result(1, reason=reason))
+        write(writer, result(2, star_field=motion(), detections=detections(1)))
     rows = read(tmp_path / "star_field.csv")
     assert [row["frame"] for row in rows] == ["0", "1", "2"]
     # A reset says more than that there is no previous frame.
@@ -162,7 +187,7 @@ def test_every_frame_has_its_star_field_line_the_first_too(tmp_path: Path):
 def test_lines_are_on_disk_after_each_frame(tmp_path: Path):
     with ResultWriter(tmp_path) as writer:
         for count in range(1, 4):
-            writer.add(result(count, star_field=motion(), detections=detections(2)))
+            write(writer, result(count, star_field=motion(), detections=detections(2)))
             assert len(read(tmp_path / "star_field.csv")) == count
             assert len(read(tmp_path / "detections.csv")) == 2 * count
             assert (tmp_path / "detections.csv").read_bytes().endswith(b"\n")
@@ -171,20 +196,20 @@ def test_lines_are_on_disk_after_each_frame(tmp_path: Path):
 def test_the_files_are_closed_by_an_exception_too(tmp_path: Path):
     def interrupted() -> ResultWriter:
         with contextlib.suppress(KeyboardInterrupt), ResultWriter(tmp_path) as writer:
-            writer.add(result(detections=detections(2)))
+            write(writer, result(detections=detections(2)))
             raise KeyboardInterrupt
         return writer
 
     writer = interrupted()
     with pytest.raises(ValueError, match="closed"):
-        writer.add(result(detections=detections(2)))
+        write(writer, result(detections=detections(2)))
     assert len(read(tmp_path / "detections.csv")) == 2
 
 
 def test_older_files_are_replaced(tmp_path: Path):
     for _ in range(2):
         with ResultWriter(tmp_path) as writer:
-            writer.add(result(detections=detections(2)))
+            write(writer, result(detections=detections(2)))
     assert len(read(tmp_path / "detections.csv")) == 2
 
 

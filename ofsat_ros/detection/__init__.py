@@ -1,0 +1,23 @@
+"""Detection: what does not move with the star field.
+
+Fifth stage.  `detect` compares two frames, as published; `find_spots` and `find_drifting` compare
+a frame with the history and leave it to ``tracking`` to tell RSOs from noise.
+"""
+
+from ofsat_ros.detection.appearance import BORDER_PX, SPOT_DTYPE, find_spots, refine, spot_near
+from ofsat_ros.detection.drift import Drift, find_drifting
+from ofsat_ros.detection.two_frames import CANDIDATE, CONFIRMED, DETECTION_DTYPE, detect
+
+__all__ = [
+    "BORDER_PX",
+    "CANDIDATE",
+    "CONFIRMED",
+    "DETECTION_DTYPE",
+    "SPOT_DTYPE",
+    "Drift",
+    "detect",
+    "find_drifting",
+    "find_spots",
+    "refine",
+    "spot_near",
+]
