@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
@@ -22,7 +23,6 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from ofsat_ros import __version__
-from ofsat_ros.detection import CONFIRMED
 from ofsat_ros.evaluation import (
     EvaluationError,
     count_frames,
@@ -41,7 +41,7 @@ from ofsat_ros.parameters import (
 )
 from ofsat_ros.pipeline import ImageError, Pipeline
 from ofsat_ros.recordings import BagWriter, Recording, RecordingError, open_recording
-from ofsat_ros.results import DETECTIONS, STAR_FIELD, TRACKS, ResultWriter
+from ofsat_ros.results import DETECTIONS, STAR_FIELD, TRACKS, ResultWriter, in_words
 from ofsat_ros.simulation import SCENARIOS, scenario, write_truth
 from ofsat_ros.tracking import Settled
 
@@ -128,26 +128,15 @@ class _Totals:
     """Counts for the summary."""
 
     def __init__(self) -> None:
-        self.frames = self.detections = self.candidates = self.left_out = 0
-        self.tracks: set[int] = set()
+        self.frames = self.left_out = 0
+        self.detections: Counter[int] = Counter()
         self.reason = ""
 
-    def count(self, detections: NDArray[np.void]) -> None:
-        """Add the detections of one frame."""
-        confirmed = detections["status"] == CONFIRMED
-        self.tracks.update(detections["track_id"][confirmed].tolist())
-        self.detections += int(confirmed.sum())
-        self.candidates += int((~confirmed).sum())
-
     def __str__(self) -> str:
-        words = f"{self.detections + self.candidates} RSO detections in {self.frames} frames"
+        words = f"{in_words(self.detections)} in {self.frames} frames"
         if self.left_out:
             words += f" ({self.left_out} more could not be processed)"
-        if self.tracks:
-            words += f", of {len(self.tracks)} tracks"
-            if self.candidates:
-                words += f" and {self.candidates} candidates"
-        if not (self.detections or self.candidates) and self.reason:
+        if not self.detections and self.reason:
             words += f"; the last frame says: {self.reason}"
         return words
 
@@ -161,7 +150,7 @@ def _process(
 
     def write(stamp_ns: int, frame: int, detections: NDArray[np.void]) -> None:
         writer.add_detections(stamp_ns, frame, detections)
-        totals.count(detections)
+        totals.detections.update(detections["track_id"].tolist())
 
     def write_settled(settled: list[Settled]) -> None:
         for last in settled:

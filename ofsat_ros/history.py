@@ -75,7 +75,7 @@ class PastFrame:
 
     @cached_property
     def envelope(self) -> Plane:
-        """Highest value of `smoothed` within 2 px of each pixel, (H, W): whether a star is near."""
+        """Highest value of `smoothed` within 2 px of each pixel, (H, W): is it beside a star."""
         side = 2 * _ENVELOPE_PX + 1
         return cv2.dilate(self.smoothed, np.ones((side, side), np.uint8))
 

@@ -233,6 +233,7 @@ class Pipeline:
             self._remember(pre, labels, result, parameters)
             self._track(pre.defects, result, parameters)
         else:
+            self._forget()
             self._settled.append(Settled(result.frame, stamp_ns, result.detections))
         result.settled, self._settled = self._settled, []
         self._previous = _Previous(stamp_ns, image.dtype, parameters, result.objects, current)
@@ -331,6 +332,8 @@ class Pipeline:
         """Add the frame to the history, at its place on the sky."""
         if parameters.history_frames != self._history.length:
             old, self._history = self._history, History(parameters.history_frames)
+            leaving = max(0, len(old) - parameters.history_frames)
+            self._settled += self._tracker.settle(old, leaving)
             for frame in old:
                 self._history.add(frame)
         motion = result.star_field
@@ -423,7 +426,7 @@ def _why_nothing(result: FrameResult) -> str:
     stars = result.star_field.star_count
     if not result.spot_count:
         return f"everything moves with the star field ({stars} stars)"
-    coasting = f"; {len(result.tracks)} tracks coast" if len(result.tracks) else ""
+    coasting = f"; tracks that coast: {len(result.tracks)}" if len(result.tracks) else ""
     return (
         f"{stars} stars; none of {result.spot_count} spots beside them lies on a path that noise"
         f" would not explain{coasting}"

@@ -1,22 +1,32 @@
 """Pictures of what was found: the last step, for people.
 
 `annotate` draws one frame; the detector node publishes it, the recorder keeps some of them.
+`summary` says in a line what there is.
 """
 
 from __future__ import annotations
+
+from itertools import product
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ofsat_ros.detection import CONFIRMED
 from ofsat_ros.pipeline import FrameResult
+from ofsat_ros.tracking import COASTING
 
 # BGR
-_STAR, _RSO, _TEXT = (255, 150, 60), (70, 70, 255), (235, 235, 235)
+_STAR, _RSO, _COASTING = (255, 150, 60), (70, 70, 255), (60, 220, 250)
+_TEXT = (235, 235, 235)
 # Points are drawn to a sixteenth of a pixel (cv2's fixed-point drawing).
 _SHIFT = 4
 _SHORTEST_SIDE = 480
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
+# px; half the side of the box around an RSO, beyond half its streak.
+_BOX_MARGIN_PX = 8
+# Part of a side that the corner of an open box is long.
+_CORNER = 0.3
 
 
 def annotate(
@@ -24,8 +34,9 @@ def annotate(
 ) -> NDArray[np.uint8]:
     """Draw what was found over the image.
 
-    Stars' flow in blue, each RSO in a red box with its flow, speed and SNR; a line on top says
-    how many there are, or why there is none.
+    Stars' flow in blue; each confirmed RSO in a red box with its flow, id, speed and SNR; of a
+    candidate's box only the corners, and no id; a yellow box where a coasting track is expected.
+    A line on top says how many there are, or why there is none.
 
     Parameters
     ----------
@@ -51,8 +62,25 @@ def annotate(
         _draw_vector(picture, flow.position[row], flow.displacement[row] * scale, zoom, _STAR)
     for rso in result.detections:
         _draw_rso(picture, rso, result.dt_s * scale, zoom)
+    for track in result.tracks[result.tracks["status"] == COASTING]:
+        _draw_box(picture, track, zoom, _COASTING, True, f"#{track['track_id']} coasting")
     _draw_caption(picture, result)
     return picture
+
+
+def summary(result: FrameResult) -> str:
+    """Say how many RSOs a frame shows, or why there is none."""
+    if result.reason:
+        return result.reason
+    confirmed = int(np.count_nonzero(result.detections["status"] == CONFIRMED))
+    candidates = len(result.detections) - confirmed
+    coasting = int(np.count_nonzero(result.tracks["status"] == COASTING))
+    words = f"{confirmed} RSO{'s' * (confirmed != 1)}" if confirmed else "no confirmed RSO"
+    if candidates:
+        words += f", {candidates} candidate{'s' * (candidates != 1)}"
+    if coasting:
+        words += f", {coasting} coasting"
+    return words
 
 
 def _stretch(image: NDArray[np.generic], result: FrameResult) -> NDArray[np.uint8]:
@@ -89,22 +117,43 @@ def _draw_vector(
 
 
 def _draw_rso(picture: NDArray[np.uint8], rso: np.void, seconds: float, zoom: int) -> None:
-    centre = np.array([rso["x"], rso["y"]])
-    half = 8 + np.nan_to_num(rso["length"]) / 2
-    low, high = _fixed(centre - half, zoom), _fixed(centre + half, zoom)
-    cv2.rectangle(picture, low, high, _RSO, 1, cv2.LINE_AA, _SHIFT)
+    confirmed = rso["status"] == CONFIRMED
     velocity = np.array([rso["vx"], rso["vy"]])
-    _draw_vector(picture, centre, velocity * seconds, zoom, _RSO)
-    name = f"#{rso['track_id']} " if rso["track_id"] else ""
+    _draw_vector(picture, np.array([rso["x"], rso["y"]]), velocity * seconds, zoom, _RSO)
+    name = f"#{rso['track_id']} " if confirmed else ""
     label = f"{name}{np.hypot(*velocity):.2f} px/s SNR {rso['snr']:.0f}"
-    _write(picture, label, (high[0] >> _SHIFT) + 4, (low[1] >> _SHIFT) + 8, _RSO)
+    _draw_box(picture, rso, zoom, _RSO, confirmed, label)
+
+
+def _draw_box(
+    picture: NDArray[np.uint8],
+    row: np.void,
+    zoom: int,
+    colour: tuple[int, int, int],
+    closed: bool,
+    label: str,
+) -> None:
+    """A square around a place, or only its corners, and a text to the right of it."""
+    centre = np.array([row["x"], row["y"]])
+    half = _BOX_MARGIN_PX + np.nan_to_num(row["length"]) / 2
+    start, end = _fixed(centre - half, zoom), _fixed(centre + half, zoom)
+    if closed:
+        cv2.rectangle(picture, start, end, colour, 1, cv2.LINE_AA, _SHIFT)
+    else:
+        bit = round(_CORNER * (end[0] - start[0]))
+        for x, y in product((start[0], end[0]), (start[1], end[1])):
+            inwards = (x + (bit if x == start[0] else -bit), y + (bit if y == start[1] else -bit))
+            for tip in ((inwards[0], y), (x, inwards[1])):
+                cv2.line(picture, (x, y), tip, colour, 1, cv2.LINE_AA, _SHIFT)
+    _write(picture, label, (end[0] >> _SHIFT) + 4, (start[1] >> _SHIFT) + 8, colour)
 
 
 def _draw_caption(picture: NDArray[np.uint8], result: FrameResult) -> None:
-    count = len(result.detections)
-    found = f"{count} RSO{'s' * (count != 1)}" if count else f"no RSO: {result.reason}"
+    found = summary(result)
+    if result.reason:
+        found = f"no RSO: {found}"
     line = f"frame {result.frame}: {found}"
-    if result.star_field is not None and count:
+    if result.star_field is not None and not result.reason:
         dx, dy = result.star_field.displacement
         line += f"; {result.star_field.star_count} stars move ({dx:+.2f}, {dy:+.2f}) px"
     _write(picture, line, 6, 16, _TEXT)

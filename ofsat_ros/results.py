@@ -8,6 +8,7 @@ so that a file reads the same whoever made it.  Times are int ns UTC, angles in 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -108,6 +109,23 @@ def detection_lines(stamp_ns: int, frame: int, detections: NDArray[np.void]) -> 
         first = [stamp_ns, frame, row["track_id"], int(row["status"] == CONFIRMED)]
         lines.append(_line(first, numbers))
     return lines
+
+
+def in_words(detections: Mapping[int, int]) -> str:
+    """Say how many detections there are.
+
+    Parameters
+    ----------
+    detections : mapping of int to int
+        Number of a track to how many are its; 0 stands for candidates.
+    """
+    words = f"{sum(detections.values())} RSO detections"
+    tracks = sum(1 for track_id in detections if track_id)
+    if tracks:
+        words += f" of {tracks} track{'s' * (tracks != 1)}"
+        if candidates := detections.get(0, 0):
+            words += f" and {candidates} candidate{'s' * (candidates != 1)}"
+    return words
 
 
 class ResultWriter:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, Self
@@ -180,6 +181,14 @@ def header(frame: SimulatedFrame, frame_id: str = "camera_optical_frame") -> Hea
 
 def image(frame: SimulatedFrame) -> Image:
     return messages.image_message(header(frame), frame.image)
+
+
+def without_rso(frame: SimulatedFrame) -> SimulatedFrame:
+    """The frame with a patch of blank sky in the place of its RSO."""
+    x, y = (round(frame.truth[name][0]) for name in ("x_px", "y_px"))
+    pixels = frame.image.copy()
+    pixels[max(0, y - 12) : y + 13, max(0, x - 16) : x + 17] = np.median(pixels)
+    return replace(frame, image=pixels)
 
 
 def write_bag(path: Path, frames: list[SimulatedFrame], topic: str = "/camera/image") -> Path:

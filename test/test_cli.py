@@ -191,7 +191,7 @@ def test_process_writes_the_pipelines_last_word(small: Path, tmp_path: Path):
     for row, result in zip(rows[1:], results[1:], strict=True):
         assert float(row["dx_px"]) == pytest.approx(result.star_field.displacement[0], rel=1e-8)
     assert done.stdout == (
-        f"{len(found)} RSO detections in 6 frames, of {len(tracks)} tracks;"
+        f"{len(found)} RSO detections of {len(tracks)} tracks in 6 frames;"
         f" detections.csv, tracks.csv and star_field.csv are in {tmp_path}/new/results\n"
     )
     assert done.stderr == ""
@@ -508,7 +508,7 @@ def test_the_program_keeps_its_two_streams_apart(small: Path, tmp_path: Path):
     done = subprocess_ofsat("process", small, "-o", tmp_path / "out")
     out, err = done.communicate(timeout=60)
     assert done.returncode == 0, err
-    assert re.fullmatch(r"\d+ RSO detections in 6 frames, of \d+ tracks; .*\n", out)
+    assert re.fullmatch(r"\d+ RSO detections of \d+ tracks in 6 frames; .*\n", out)
     # No progress bar where nobody watches, and no warning.
     assert err == ""
     assert len(read(tmp_path / "out/star_field.csv")) == 6
@@ -527,7 +527,7 @@ def test_the_progress_bar_is_on_standard_error(small: Path, tmp_path: Path):
     shown = os.read(master, 65536).decode()
     os.close(master)
     assert done.returncode == 0
-    assert re.fullmatch(r"\d+ RSO detections in 6 frames, of \d+ tracks; .*\n", done.stdout)
+    assert re.fullmatch(r"\d+ RSO detections of \d+ tracks in 6 frames; .*\n", done.stdout)
     assert re.search(r"6/6 .* frames", shown)
 
 

@@ -10,12 +10,13 @@ from sensor_msgs.msg import CompressedImage, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
-from ofsat_ros.detection import DETECTION_DTYPE
+from ofsat_ros.detection import CANDIDATE, CONFIRMED, DETECTION_DTYPE
 from ofsat_ros.images import EncodingError, decode_message, encode_png
 from ofsat_ros.nodes import messages
 from ofsat_ros.optical_flow import Flow
 from ofsat_ros.pipeline import FrameResult
 from ofsat_ros.star_field import StarFieldMotion
+from ofsat_ros.tracking import COASTING, TRACK_DTYPE
 
 HEADER = Header(stamp=messages.time_message(1_700_000_000_123_456_789), frame_id="optical")
 
@@ -26,13 +27,30 @@ def detections(count: int = 3, seed: int = 0) -> np.ndarray:
     for name in DETECTION_DTYPE.names:
         if DETECTION_DTYPE[name].kind == "f":
             rows[name] = random.uniform(1, 100, count)
-    rows["track_id"], rows["status"], rows["flow_index"] = np.arange(count), 1, -1
+    rows["track_id"], rows["status"] = 1 + np.arange(count), CONFIRMED
+    rows["object_index"] = rows["flow_index"] = -1
     return rows
 
 
-def result(rows: np.ndarray, flow: Flow | None = None) -> FrameResult:
-    about = {"dt_s": 0.5, "detections": rows, "flow": flow or Flow.empty()}
+def tracks(*statuses: int) -> np.ndarray:
+    random = np.random.default_rng(2)
+    rows = np.zeros(len(statuses), TRACK_DTYPE)
+    for name in TRACK_DTYPE.names:
+        if TRACK_DTYPE[name].kind == "f":
+            rows[name] = random.uniform(1, 100, len(rows))
+    rows["track_id"], rows["status"] = 4_000_000_000 + np.arange(len(rows)), statuses
+    rows["hits"], rows["misses"] = 5 + np.arange(len(rows)), np.arange(len(rows))
+    return rows
+
+
+def result(rows: np.ndarray, flow: Flow | None = None, **values) -> FrameResult:
+    about = {"dt_s": 0.5, "detections": rows, "flow": flow or Flow.empty(), **values}
     return FrameResult(stamp_ns=0, frame=1, shape=(100, 100), **about)
+
+
+def points_of(marker: Marker) -> np.ndarray:
+    """Begin and end of each line, (N, 2, 2) px."""
+    return np.reshape([(p.x, p.y) for p in marker.points], (-1, 2, 2))
 
 
 def field(inliers: list[bool]) -> StarFieldMotion:
@@ -129,12 +147,23 @@ def test_an_image_that_is_too_short_is_an_encoding_error():
         decode_message(message)
 
 
-def test_cloud_has_the_fields_of_the_design():
-    cloud = messages.detections_cloud(HEADER, detections(2))
+@pytest.mark.parametrize(
+    ("cloud", "more"),
+    [
+        (messages.detections_cloud(HEADER, detections(2)), {}),
+        (
+            messages.tracks_cloud(HEADER, tracks(CONFIRMED, COASTING)),
+            dict.fromkeys(("sigma_u_rate", "sigma_v_rate", "age"), PointField.FLOAT64)
+            | dict.fromkeys(("hits", "misses"), PointField.UINT32),
+        ),
+    ],
+    ids=["detections", "tracks"],
+)
+def test_cloud_has_the_fields_of_the_design(cloud, more):
     doubles = "u v u_rate v_rate rel_u_rate rel_v_rate sigma_u sigma_v snr flux length angle"
     expected = dict.fromkeys(doubles.split() + ["ra", "dec"], PointField.FLOAT64)
     expected |= dict.fromkeys("xyz", PointField.FLOAT32)
-    expected |= {"id": PointField.UINT32, "status": PointField.UINT8}
+    expected |= {"id": PointField.UINT32, "status": PointField.UINT8, **more}
     assert {f.name: f.datatype for f in cloud.fields} == expected
     assert {f.count for f in cloud.fields} == {1}
     assert (cloud.height, cloud.width) == (1, 2)
@@ -165,6 +194,35 @@ def test_detections_come_back_from_a_cloud():
     assert np.isnan(back["significance"]).all()  # what is not carried is unknown, not 0
     assert (back["object_index"] == -1).all()
     assert (back["flow_index"] == -1).all()
+
+
+def test_cloud_holds_the_tracks_and_they_come_back():
+    rows = tracks(CONFIRMED, COASTING, CONFIRMED)
+    cloud = messages.tracks_cloud(HEADER, rows)
+    assert cloud.header == HEADER
+    heard = messages.cloud_array(deserialize_message(serialize_message(cloud), PointCloud2))
+    columns = {"u": "x", "rel_v_rate": "rel_vy", "sigma_u": "sigma_x", "id": "track_id"}
+    columns |= {"sigma_u_rate": "sigma_vx", "sigma_v_rate": "sigma_vy"}
+    for field, column in columns.items():
+        np.testing.assert_array_equal(heard[field], rows[column])
+    for name in ("snr", "age", "hits", "misses", "status"):
+        np.testing.assert_array_equal(heard[name], rows[name])
+    for name in "xyz":
+        assert np.isnan(heard[name]).all()
+
+    back = messages.tracks_array(cloud)
+    assert back.dtype == TRACK_DTYPE
+    for name in set(TRACK_DTYPE.names) - {"log_false"}:
+        np.testing.assert_array_equal(back[name], rows[name])
+    assert np.isnan(back["log_false"]).all()
+
+
+def test_what_reads_detections_reads_tracks_too_but_not_the_other_way():
+    rows = tracks(CONFIRMED)
+    back = messages.detections_array(messages.tracks_cloud(HEADER, rows))
+    assert back["x"] == rows["x"]
+    with pytest.raises(messages.MessageError, match="no field age, hits, misses, sigma_u_rate"):
+        messages.tracks_array(messages.detections_cloud(HEADER, detections(1)))
 
 
 def test_a_cloud_of_something_else_says_what_it_lacks():
@@ -210,12 +268,15 @@ def test_empty_cloud_is_whole():
     cloud = messages.detections_cloud(HEADER, detections(0))
     assert (cloud.width, len(cloud.data), len(cloud.fields)) == (0, 0, len(messages.CLOUD_DTYPE))
     assert len(messages.cloud_array(cloud)) == 0
+    cloud = messages.tracks_cloud(HEADER, tracks())
+    assert (cloud.width, len(cloud.data)) == (0, 0)
+    assert len(messages.tracks_array(cloud)) == 0
 
 
 def test_stars_are_what_moves_with_the_field_and_is_no_detection():
     vectors = flow(6)
     rows = detections(2)
-    rows["flow_index"] = [4, -1]
+    rows["object_index"] = [4, -1]
     found = result(rows, vectors)
     without_field = messages.flow_markers(HEADER, found, scale=3.0)
     assert "star_flow" not in {m.ns for m in without_field.markers}
@@ -240,6 +301,9 @@ def test_rso_markers_have_a_box_and_an_id_each():
     assert len(flow_marker.points) == 6
     boxes = [m for m in array.markers if m.ns == "rso_boxes"]
     texts = [m for m in array.markers if m.ns == "rso_ids"]
+    assert {(m.color.r, m.color.b) for m in boxes + texts} == {
+        (flow_marker.color.r, flow_marker.color.b)
+    }
     assert len({(m.ns, m.id) for m in array.markers[1:]}) == len(array.markers) - 1
     for row, box, text in zip(rows, boxes, texts, strict=True):
         x, y = np.array([(p.x, p.y) for p in box.points]).T
@@ -247,8 +311,42 @@ def test_rso_markers_have_a_box_and_an_id_each():
         assert (y.min() + y.max()) / 2 == pytest.approx(row["y"])
         assert x.max() - x.min() > row["length"]
         assert text.pose.position.x == pytest.approx(row["x"])
-        assert text.text.startswith(str(row["track_id"] or "?"))
+        assert text.text.startswith(f"{row['track_id']} ")
         assert box.pose.orientation.w == text.pose.orientation.w == 1.0
+
+
+def test_a_candidate_has_corners_and_no_id():
+    rows = detections(2)
+    rows["status"], rows["track_id"] = [CONFIRMED, CANDIDATE], [8, 0]
+    array = messages.flow_markers(HEADER, result(rows), scale=1.0)
+    whole, open_ = (points_of(m) for m in array.markers if m.ns == "rso_boxes")
+    (text,) = [m for m in array.markers if m.ns == "rso_ids"]
+    assert text.text.startswith("8 ")
+    side = np.ptp(whole[..., 0])
+    drawn = np.hypot(*(whole[:, 1] - whole[:, 0]).T).sum()
+    assert drawn == pytest.approx(4 * side)
+    # Around the same place, but with gaps: the middle of each side is free.
+    centre = np.array([rows["x"][1], rows["y"][1]])
+    side = np.ptp(open_[..., 0])
+    np.testing.assert_allclose(open_.reshape(-1, 2).mean(axis=0), centre)
+    drawn = np.hypot(*(open_[:, 1] - open_[:, 0]).T).sum()
+    assert drawn < 0.8 * 4 * side
+    (flow_marker,) = [m for m in array.markers if m.ns == "rso_flow"]
+    assert len(flow_marker.points) == 4  # it moves as well
+
+
+def test_coasting_tracks_have_a_box_of_their_own_where_they_are_expected():
+    rows = tracks(CONFIRMED, COASTING)
+    array = messages.flow_markers(HEADER, result(detections(1), tracks=rows), scale=1.0)
+    (box,) = [m for m in array.markers if m.ns == "coasting_boxes"]
+    place = [rows["x"][1], rows["y"][1]]
+    np.testing.assert_allclose(points_of(box).reshape(-1, 2).mean(axis=0), place)
+    assert box.color.g > 0.5 > box.color.b  # yellow, not red
+    texts = {m.text for m in array.markers if m.ns == "rso_ids"}
+    assert f"{rows['track_id'][1]}  coasting" in texts
+    assert len(texts) == 2
+    names = [(m.ns, m.id) for m in array.markers[1:]]
+    assert len(set(names)) == len(names)
 
 
 def test_unknown_length_still_gives_a_box():

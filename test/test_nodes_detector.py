@@ -8,18 +8,29 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
-from ros_graph import PATIENCE_S, Graph, header, image, padded_big_endian, sky, stamps
+from ros_graph import (
+    PATIENCE_S,
+    Graph,
+    header,
+    image,
+    padded_big_endian,
+    sky,
+    stamps,
+    without_rso,
+)
 from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from ofsat_ros import report
+from ofsat_ros.detection import CONFIRMED
 from ofsat_ros.images import encode_png
 from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.detector import Detector
 from ofsat_ros.nodes.health import Health
 from ofsat_ros.parameters import Parameters
 from ofsat_ros.pipeline import Pipeline
+from ofsat_ros.tracking import COASTING
 
 RELIABLE = ("-p", "reliable_input:=true")
 DOUBLE, INTEGER, STRING = 3, 2, 4
@@ -37,9 +48,11 @@ class Station:
         self.graph = graph
         self.detector = graph.add(Detector(context=graph.context))
         self.clouds = graph.listen(PointCloud2, "rso_detections")
+        self.tracks = graph.listen(PointCloud2, "rso_tracks")
         self.motions = graph.listen(Vector3Stamped, "star_field_motion")
         self.camera = graph.publisher(kind, topic)
-        graph.connect(self.camera, *self.outputs("rso_detections", "star_field_motion"))
+        answers = self.outputs("rso_detections", "rso_tracks", "star_field_motion")
+        graph.connect(self.camera, *answers)
 
     def outputs(self, *topics: str) -> list:
         return [p for p in self.detector.publishers if p.topic_name.strip("/") in topics]
@@ -50,7 +63,8 @@ class Station:
         for one in images:
             self.camera.publish(one)
             self.graph.serve_once()
-        self.graph.until(lambda: len(self.clouds) >= wanted and len(self.motions) >= wanted)
+        answers = (self.clouds, self.tracks, self.motions)
+        self.graph.until(lambda: min(map(len, answers)) >= wanted)
 
     def set(self, **values):
         """Set parameters in one call; return the result."""
@@ -92,12 +106,56 @@ def test_every_frame_is_answered_once_in_order(kind, make):
         station.send(*map(make, frames))
         graph.serve(0.2)
     assert stamps(station.clouds) == [f.stamp_ns for f in frames]
+    assert stamps(station.tracks) == [f.stamp_ns for f in frames]
     assert stamps(station.motions) == [f.stamp_ns for f in frames]
     assert {c.header.frame_id for c in station.clouds} == {"camera_optical_frame"}
     for cloud, rows in zip(station.clouds, detections, strict=True):
         heard = messages.cloud_array(cloud)
         np.testing.assert_array_equal(heard["u"], rows["x"])
         np.testing.assert_array_equal(heard["v_rate"], rows["vy"])
+
+
+def test_tracks_keep_their_id_and_coast_while_the_rso_is_not_seen():
+    frames = sky(10)
+    frames[6:8] = map(without_rso, frames[6:8])
+    pipeline = Pipeline()
+    expected = [pipeline.process(f.image, f.stamp_ns) for f in frames]
+    with Graph(*RELIABLE) as graph:
+        station = Station(graph)
+        station.send(*map(image, frames))
+    for cloud, one in zip(station.tracks, expected, strict=True):
+        heard = messages.tracks_array(cloud)
+        for name in set(heard.dtype.names) - {"log_false"}:
+            np.testing.assert_array_equal(heard[name], one.tracks[name])
+    first, *seen = [n for n, one in enumerate(expected) if len(one.tracks)]
+    assert first <= 3
+    assert seen == list(range(first + 1, 10))
+    for number in (first, *seen):
+        (track,) = messages.tracks_array(station.tracks[number])
+        rsos = messages.detections_array(station.clouds[number])
+        confirmed = rsos[rsos["status"] == CONFIRMED]
+        hidden = number in (6, 7)
+        assert track["status"] == (COASTING if hidden else CONFIRMED)
+        assert confirmed["track_id"].tolist() == ([] if hidden else [track["track_id"]])
+        assert track["track_id"] == 1
+        truth = frames[number].truth[0]
+        # Two frames ahead, a velocity of some 0.1 px a frame still holds.
+        assert np.hypot(track["x"] - truth["x_px"], track["y"] - truth["y_px"]) < 1.5
+    assert (track["hits"], track["misses"]) == (8 - first + 2, 2)
+    assert track["age"] == pytest.approx(9 * 0.5)
+
+
+def test_two_frames_alone_make_candidates_and_no_track():
+    frames = sky(6)
+    with Graph(*RELIABLE, "-p", "rso_test:=vector") as graph:
+        station = Station(graph)
+        station.send(*map(image, frames))
+    rows = np.concatenate([messages.detections_array(cloud) for cloud in station.clouds])
+    assert len(rows) >= 4
+    assert not rows["track_id"].any()
+    assert not rows["status"].any()
+    assert [cloud.width for cloud in station.tracks] == [0] * 6
+    assert stamps(station.tracks) == [f.stamp_ns for f in frames]
 
 
 def test_detections_and_markers_say_the_same():
@@ -157,7 +215,8 @@ def test_an_image_that_cannot_be_decoded_is_answered_empty_and_the_node_lives_on
         assert status.level == DiagnosticStatus.OK
         graph.until(lambda: len(arrays) == 4)
     assert stamps(station.clouds) == [f.stamp_ns for f in frames]
-    assert [c.width for c in station.clouds[1:3]] == [0, 0]
+    assert stamps(station.tracks) == [f.stamp_ns for f in frames]
+    assert [c.width for c in station.clouds[1:3] + station.tracks[1:3]] == [0] * 4
     assert [m.action for m in arrays[1].markers] == [Marker.DELETEALL]
     assert np.isnan(station.motions[1].vector.x)
 
@@ -260,7 +319,7 @@ def test_reset_and_enable():
         station.camera.publish(image(frames[5]))
         status = station.diagnostics_when(lambda s: values(s)["frames_received"] == "6")
         assert "disabled" in status.message
-        assert len(station.clouds) == 5
+        assert len(station.clouds) == len(station.tracks) == 5
         graph.call(SetBool, "detector/enable", SetBool.Request(data=True))
         station.send(image(frames[6]), image(frames[7]))
         known = [np.isfinite(m.vector.x) for m in station.motions]
@@ -319,13 +378,42 @@ def test_changes_take_effect_at_the_next_frame():
     assert higher[1] > 1.5 * smoother[1]
 
 
+def test_tracking_changes_while_it_runs():
+    frames = sky(12)
+    by_hand = Pipeline()
+    confirmed = []
+    changes = {
+        0: {"max_speed_px": 1.0},  # a frame: slower than the RSO
+        4: {"max_speed_px": 100.0, "false_tracks": 0.01},
+        6: {"history_frames": 4, "coast_frames": 0},
+        9: {"history_frames": 20},
+    }
+    with Graph(*RELIABLE) as graph:
+        station = Station(graph)
+        for number, frame in enumerate(frames):
+            if number in changes:
+                result = station.set(**changes[number])
+                assert result.successful, result.reason
+                by_hand.parameters = by_hand.parameters.replace(**changes[number])
+            expected = by_hand.process(frame.image, frame.stamp_ns).tracks
+            station.send(image(frame))
+            heard = messages.tracks_array(station.tracks[-1])
+            np.testing.assert_array_equal(heard["x"], expected["x"])
+            np.testing.assert_array_equal(heard["track_id"], expected["track_id"])
+            confirmed.append(len(heard))
+        assert not station.set(history_frames=2).successful
+        assert not station.set(false_tracks=0.0).successful
+    assert confirmed[:4] == [0] * 4
+    assert confirmed[4:] == [1] * 8
+
+
 def test_descriptors_come_from_the_table():
     with Graph() as graph:
         graph.add(Detector(context=graph.context))
-        names = ["smoothing_sigma_px", "engine", "preset", "window_px"]
+        names = ["smoothing_sigma_px", "engine", "preset", "window_px", "history_frames"]
         request = DescribeParameters.Request(names=names)
         service = "detector/describe_parameters"
-        sigma, engine, preset, window = graph.call(
+        sigma, engine, preset, window, history = graph.call(
             DescribeParameters, service, request
         ).descriptors
     assert "[px]" in sigma.description
@@ -334,6 +422,7 @@ def test_descriptors_come_from_the_table():
     assert engine.additional_constraints == "sparse | dense"
     assert (preset.read_only, engine.read_only) == (True, False)
     assert window.integer_range[0].to_value == 101
+    assert (history.integer_range[0].from_value, history.read_only) == (3, False)
 
 
 def test_start_values_yaml_preset_and_command_line(tmp_path):
@@ -369,6 +458,41 @@ def test_diagnostics_say_what_is_found():
     assert 0 < float(found["latency_s"]) < 10
     assert abs(float(found["star_motion_x_px_s"])) < 0.5
     assert float(found["threshold_dn"]) > float(found["noise_dn"]) > 0
+    assert (found["rso_confirmed"], found["tracks"], found["tracks_coasting"]) == ("1", "1", "0")
+    assert float(found["star_residual_px"]) < 0.5
+    assert status.message.startswith("1 RSO")
+
+
+def test_diagnostics_come_with_every_frame():
+    frames = sky(6)
+    frames[5] = without_rso(frames[5])
+    pipeline = Pipeline()
+    expected = [pipeline.process(f.image, f.stamp_ns) for f in frames]
+    with Graph(*RELIABLE) as graph:
+        station = Station(graph)
+        heard = graph.listen(DiagnosticArray, "/diagnostics")
+        graph.connect(*station.outputs("diagnostics"))
+        station.send(*map(image, frames))
+
+        def by_frame() -> dict[str, DiagnosticStatus]:
+            every = [array.status[0] for array in heard]
+            return {values(s)["stamp_ns"]: s for s in every if "stamp_ns" in values(s)}
+
+        graph.until(lambda: len(by_frame()) == len(frames))
+    for frame, one in zip(frames, expected, strict=True):
+        status = by_frame()[str(frame.stamp_ns)]
+        found = values(status)
+        confirmed = int(np.count_nonzero(one.detections["status"] == CONFIRMED))
+        assert found["frame"] == str(one.frame)
+        assert found["objects"] == str(len(one.objects))
+        assert found["spots"] == str(one.spot_count)
+        assert found["rso_confirmed"] == str(confirmed)
+        assert found["rso_candidates"] == str(len(one.detections) - confirmed)
+        assert found["tracks"] == str(len(one.tracks))
+        assert found["nothing_detected_because"] == one.reason
+        assert status.message == report.summary(one)
+    assert found["tracks_coasting"] == "1"
+    assert found["nothing_detected_because"]
 
 
 def test_no_image_is_said_and_forgotten_when_one_comes():

@@ -3,10 +3,15 @@
 import sys
 import threading
 
+import numpy as np
 import pytest
 
+from ofsat_ros.detection import CANDIDATE, CONFIRMED, DETECTION_DTYPE
 from ofsat_ros.nodes.health import Health
+from ofsat_ros.objects import OBJECT_DTYPE
 from ofsat_ros.pipeline import FrameResult
+from ofsat_ros.star_field import StarFieldMotion
+from ofsat_ros.tracking import COASTING, TRACK_DTYPE
 
 PROFILE = "/share/profile.xml"
 
@@ -89,6 +94,68 @@ def test_a_failure_is_said_until_a_frame_succeeds(clock):
     assert problems(one) == []
     assert one.summary() == "no object"
     assert one.values()["frames_failed"] == one.values()["frames_processed"] == 1
+
+
+def rows(dtype: np.dtype, *statuses: int) -> np.ndarray:
+    made = np.zeros(len(statuses), dtype)
+    made["status"] = statuses
+    return made
+
+
+def frame(**values) -> FrameResult:
+    """A frame with 5 stars that move (4, -1) px and turn by 0.01 rad in half a second."""
+    field = StarFieldMotion(
+        centre=np.zeros(2),
+        displacement=np.array([4.0, -1.0]),
+        rotation=0.01,
+        scale=0.0,
+        covariance=np.eye(4),
+        inliers=np.arange(8) < 5,
+        residual_px=0.125,
+        residual_sigmas=1.0,
+        speed_mean=4.1,
+        speed_std=0.1,
+        model="similarity",
+    )
+    about = {
+        "dt_s": 0.5,
+        "objects": np.zeros(8, OBJECT_DTYPE),
+        "star_field": field,
+        "detections": rows(DETECTION_DTYPE, CONFIRMED, CONFIRMED, CANDIDATE),
+        "tracks": rows(TRACK_DTYPE, CONFIRMED, COASTING, CONFIRMED),
+        "spot_count": 7,
+        "noise": 2.5,
+        "background": 1000.0,
+        "threshold": 10.0,
+    }
+    return FrameResult(**{"stamp_ns": 123, "frame": 6, "shape": (10, 10), **about, **values})
+
+
+def test_values_are_those_of_the_last_frame(clock):
+    one = health()
+    one.processed(frame(), latency_s=0.1)
+    expected = {"frame": 6, "stamp_ns": 123, "objects": 8, "stars": 5, "spots": 7}
+    expected |= {"rso_confirmed": 2, "rso_candidates": 1, "tracks": 3, "tracks_coasting": 1}
+    expected |= {"noise_dn": 2.5, "background_dn": 1000.0, "threshold_dn": 10.0}
+    expected |= {"star_motion_x_px": 4.0, "star_motion_y_px": -1.0}
+    expected |= {"star_motion_x_px_s": 8.0, "star_motion_y_px_s": -2.0}
+    expected |= {"star_rotation_rad_s": 0.02, "star_residual_px": 0.125}
+    expected |= {"frame_interval_s": 0.5, "nothing_detected_because": ""}
+    assert expected.items() <= one.values().items()
+    assert one.summary() == "2 RSOs, 1 candidate, 1 coasting"
+
+
+def test_without_a_star_field_its_motion_is_unknown(clock):
+    one = health()
+    none = rows(DETECTION_DTYPE)
+    why = "the 3 flow vectors do not agree on a motion of the star field"
+    one.processed(frame(star_field=None, detections=none, reason=why), latency_s=0.1)
+    values = one.values()
+    motion = [value for name, value in values.items() if name.startswith("star_")]
+    assert len(motion) == 6
+    assert np.isnan(motion).all()
+    assert (values["stars"], values["rso_confirmed"], values["objects"]) == (0, 0, 8)
+    assert values["nothing_detected_because"] == one.summary() == why
 
 
 def test_rate_is_of_the_last_seconds(clock):

@@ -24,6 +24,7 @@ from ofsat_ros.nodes import demo, messages
 from ofsat_ros.nodes.recorder import HEARING, Recorder
 from ofsat_ros.nodes.runtime import StartError
 from ofsat_ros.recordings import Bag
+from ofsat_ros.tracking import TRACK_DTYPE
 
 FRAMES = sky(6)
 FOUND = [0, 2, 0, 0, 1, 0]  # detections per frame
@@ -37,9 +38,12 @@ def results(number: int) -> dict[str, object]:
     for name in ("u", "v", "u_rate", "v_rate", "rel_u_rate", "rel_v_rate", "snr", "angle"):
         rows[name] = random.uniform(-1.5, 1.5, len(rows))
     rows["id"], rows["status"] = 7, CONFIRMED
+    tracks = np.zeros(number, TRACK_DTYPE)
+    tracks["x"], tracks["track_id"], tracks["hits"] = 3.25, 7, number
     picture = np.full((20, 30, 3), (10 * number, 0, 250), np.uint8)
     return {
         "rso_detections": messages.cloud_message(head, rows),
+        "rso_tracks": messages.tracks_cloud(head, tracks),
         "star_field_motion": messages.star_field_vector(head, None),
         "flow_markers": messages.no_flow_markers(head),
         "image_annotated": messages.image_message(head, picture),
@@ -55,7 +59,7 @@ def rows_of(folder: Path) -> list[dict[str, str]]:
 def recorded(tmp_path_factory) -> tuple[Path, list[dict[str, object]]]:
     """Folder of a recorder that heard six frames, and what was published."""
     folder = tmp_path_factory.mktemp("recorder") / "output"
-    kinds = [PointCloud2, Vector3Stamped, MarkerArray, Image]
+    kinds = [PointCloud2, PointCloud2, Vector3Stamped, MarkerArray, Image]
     published = [results(number) for number in range(len(FRAMES))]
     stop = threading.Event()
     arguments = ("-p", f"output:={folder}", "-p", "picture_every:=4", "-p", "frames:=6")
@@ -103,7 +107,7 @@ def test_detections_csv_has_the_columns_of_the_design(recorded):
 
 def test_results_bag_holds_what_was_published(recorded):
     folder, published = recorded
-    topics = ["/rso_detections", "/star_field_motion", "/flow_markers"]
+    topics = ["/rso_detections", "/rso_tracks", "/star_field_motion", "/flow_markers"]
     with Bag(folder / "results") as bag:
         assert {name: about.count for name, about in bag.topics.items()} == dict.fromkeys(
             topics, 6
@@ -185,7 +189,7 @@ def test_table_and_files_are_whole_after_a_signal(tmp_path):
     assert [line.split()[2] for line in lines[first + 2 : first + 4]] == ["1", "1"]
     when = time.gmtime(FRAMES[1].stamp_ns // 10**9)
     assert lines[first + 2].startswith(time.strftime("%Y-%m-%d %H:%M:%S", when))
-    assert "5 frames, 3 RSO detections" in lines[-1]
+    assert "5 frames, 3 RSO detections of 1 track;" in lines[-1]
     assert len(rows_of(folder)) == 3
     with Bag(folder / "results") as bag:
         assert bag.topics["/rso_detections"].count == 5
@@ -201,6 +205,7 @@ def test_what_is_not_a_detectors_is_left_out(tmp_path):
     foreign = [
         ("rso_detections", PointCloud2(fields=[field], point_step=4, width=2, data=bytes(8))),
         ("rso_detections", messages.cloud_message(early, messages.cloud_rows(1))),
+        ("rso_tracks", messages.tracks_cloud(early, np.zeros(1, TRACK_DTYPE))),
         ("star_field_motion", messages.star_field_vector(early, None)),
         ("flow_markers", MarkerArray()),
         ("image_annotated", messages.image_message(header(FRAMES[0]), FRAMES[0].image)),
@@ -223,7 +228,8 @@ def test_what_is_not_a_detectors_is_left_out(tmp_path):
     assert [p.name for p in folder.glob("*.png")] == ["frame_000001.png"]
     with Bag(folder / "results") as bag:
         counts = {name: about.count for name, about in bag.topics.items()}
-    assert counts == {"/rso_detections": 2, "/star_field_motion": 1, "/flow_markers": 1}
+    others = dict.fromkeys(("/rso_tracks", "/star_field_motion", "/flow_markers"), 1)
+    assert counts == {"/rso_detections": 2, **others}
 
 
 def test_pictures_that_come_at_once_are_all_kept(tmp_path):
@@ -273,9 +279,13 @@ def test_demo_from_start_to_end(tmp_path):
     given = ("--bag", f"{bag}", "--output", f"{output}", "--rate", "0")
     with Process(tmp_path, "demo", *given) as shown:
         assert shown.wait(60) == 0, shown.err
-    said = re.search(r"12 frames played, 12 answered, (\d+) RSO detections", shown.out)
+    said = re.search(
+        r"12 frames played, 12 answered, (\d+) RSO detections of 1 track;",
+        shown.out,
+    )
     found = rows_of(output)
     assert len(found) == int(said[1]) >= 5
+    assert all(row["confirmed"] == "1" for row in found)
     assert {int(row["stamp_ns"]) for row in found} <= {f.stamp_ns for f in frames}
     near = 0
     for row in found:
@@ -291,6 +301,10 @@ def test_demo_from_start_to_end(tmp_path):
     assert (output / "frame_000010.png").exists()
     with Bag(output / "results") as results_bag:
         assert results_bag.topics["/flow_markers"].count == 12
+        clouds = results_bag.messages(["/rso_tracks"])
+        kept = [deserialize_message(bytes(data), PointCloud2) for *_, data in clouds]
+    assert [cloud.header.stamp for cloud in kept] == [header(f).stamp for f in frames]
+    assert {int(i) for cloud in kept for i in messages.tracks_array(cloud)["track_id"]} == {1}
 
 
 def test_demo_leaves_no_process_behind(tmp_path):

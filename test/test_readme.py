@@ -18,7 +18,7 @@ import pytest
 from ros_graph import Process
 
 from ofsat_ros.parameters import Parameters
-from ofsat_ros.results import DETECTION_COLUMNS, STAR_FIELD_COLUMNS
+from ofsat_ros.results import DETECTION_COLUMNS, STAR_FIELD_COLUMNS, TRACK_COLUMNS
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -125,6 +125,7 @@ def test_columns_of_files_are_the_present_ones() -> None:
     text = " ".join(INTEGRATION.split())
     assert ", ".join(DETECTION_COLUMNS) in text
     assert ", ".join(STAR_FIELD_COLUMNS) in text
+    assert ", ".join(TRACK_COLUMNS) in text
 
 
 def test_pictures_are_the_present_ones() -> None:
@@ -138,7 +139,8 @@ def test_pictures_are_the_present_ones() -> None:
 
 
 def test_links_lead_somewhere() -> None:
-    for page in ("README.md", "docs/algorithm.md", "docs/integration.md", "bags/README.md"):
+    pages = [path.relative_to(ROOT) for path in (ROOT / "docs").glob("*.md")]
+    for page in ("README.md", "bags/README.md", *pages):
         text = (ROOT / page).read_text()
         for target in re.findall(r"\]\(([^)#]+)[^)]*\)", text):
             assert (ROOT / page).parent.joinpath(target).exists(), (page, target)

@@ -6,11 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from ofsat_ros.detection import DETECTION_DTYPE
+from ofsat_ros.detection import CANDIDATE, CONFIRMED, DETECTION_DTYPE
 from ofsat_ros.optical_flow import Flow
 from ofsat_ros.pipeline import FrameResult
-from ofsat_ros.report import annotate
+from ofsat_ros.report import annotate, summary
 from ofsat_ros.star_field import StarFieldMotion
+from ofsat_ros.tracking import COASTING, TRACK_DTYPE
 
 HEIGHT, WIDTH = 500, 640
 STARS = np.array([(100.0, 120.0), (400.0, 150.0), (250.0, 400.0)])
@@ -45,7 +46,8 @@ def result(shape: tuple[int, int] = (HEIGHT, WIDTH), found: bool = True, **value
         rows["x"], rows["y"] = RSO
         rows["vx"], rows["vy"] = RSO_STEP / 0.5
         rows["snr"] = 25
-        rows["flow_index"] = 3
+        rows["track_id"], rows["status"] = 12, CONFIRMED
+        rows["object_index"], rows["flow_index"] = 3, -1
     position = np.vstack([STARS, RSO])
     displacement = np.vstack([np.tile(STEP, (len(STARS), 1)), RSO_STEP])
     valid, index = np.ones(4, bool), np.arange(4)
@@ -61,6 +63,13 @@ def result(shape: tuple[int, int] = (HEIGHT, WIDTH), found: bool = True, **value
     return FrameResult(1, 7, shape, **{**about, **values})
 
 
+def tracks(*statuses: int) -> np.ndarray:
+    rows = np.zeros(len(statuses), TRACK_DTYPE)
+    rows["x"], rows["y"] = 150, 250
+    rows["track_id"], rows["status"] = 31 + np.arange(len(rows)), statuses
+    return rows
+
+
 def red(picture: np.ndarray) -> np.ndarray:
     b, g, r = (picture[..., i].astype(int) for i in range(3))
     return (r > 100) & (r - b > 60) & (r - g > 60)
@@ -69,6 +78,11 @@ def red(picture: np.ndarray) -> np.ndarray:
 def blue(picture: np.ndarray) -> np.ndarray:
     b, _, r = (picture[..., i].astype(int) for i in range(3))
     return (b > 100) & (b - r > 60)
+
+
+def yellow(picture: np.ndarray) -> np.ndarray:
+    b, g, r = (picture[..., i].astype(int) for i in range(3))
+    return (r > 100) & (abs(r - g) < 50) & (g - b > 60)
 
 
 def white(picture: np.ndarray) -> np.ndarray:
@@ -141,6 +155,31 @@ def test_an_rso_has_a_red_box_and_vector():
     assert not mask[beyond[1] - 1 : beyond[1] + 2, beyond[0] - 1 : beyond[0] + 2].any()
 
 
+def test_of_a_candidates_box_only_the_corners_are_drawn():
+    found = result()
+    found.detections["status"], found.detections["track_id"] = CANDIDATE, 0
+    mask = red(annotate(dark(), found, scale=1.0))
+    x, y = RSO.astype(int)
+    for offset in (-8, 8):
+        for line in (mask[y + offset, x - 8 : x + 9], mask[y - 8 : y + 9, x + offset]):
+            assert line[:4].all()
+            assert line[-4:].all()
+            assert not line[6:11].any()
+
+
+def test_a_coasting_track_has_a_yellow_box_where_it_is_expected():
+    found = result(tracks=tracks(COASTING, CONFIRMED))
+    found.tracks["x"][1] = 500  # what is seen is drawn as a detection
+    picture = annotate(dark(), found)
+    mask = yellow(picture)
+    for offset in (-8, 8):
+        assert mask[250 + offset, 144:157].mean() > 0.8
+        assert mask[244:257, 150 + offset].mean() > 0.8
+    assert not mask[244:257, 144:157].any()
+    assert not mask[:, 450:].any()
+    assert not red(picture)[240:261, 140:161].any()
+
+
 def test_a_streaks_box_is_as_much_larger_as_it_is_long():
     found = result()
     found.detections["length"] = 40
@@ -192,19 +231,33 @@ def test_the_caption_counts_the_rsos_or_gives_the_reason(monkeypatch: pytest.Mon
     annotate(dark(), result())
     # Twice each: a dark rim, then the text.
     assert set(written) == {
-        "10.77 px/s SNR 25",
+        "#12 10.77 px/s SNR 25",
         "frame 7: 1 RSO; 3 stars move (+6.00, -4.00) px",
     }
     written.clear()
     annotate(dark(), result(found=False))
     assert set(written) == {"frame 7: no RSO: everything moves with the star field (3 stars)"}
     written.clear()
-    two = result()
+    two = result(tracks=tracks(COASTING))
     two.detections = np.repeat(two.detections, 2)
-    two.detections["track_id"] = 12, 0
+    two.detections["track_id"], two.detections["status"] = (12, 0), (CONFIRMED, CANDIDATE)
     annotate(dark(), two)
-    assert {"#12 10.77 px/s SNR 25", "10.77 px/s SNR 25"} < set(written)
-    assert "frame 7: 2 RSOs; 3 stars move (+6.00, -4.00) px" in written
+    assert {"#12 10.77 px/s SNR 25", "10.77 px/s SNR 25", "#31 coasting"} < set(written)
+    assert "frame 7: 1 RSO, 1 candidate, 1 coasting; 3 stars move (+6.00, -4.00) px" in written
+
+
+@pytest.mark.parametrize(
+    ("statuses", "words"),
+    [
+        ([CONFIRMED], "1 RSO"),
+        ([CONFIRMED, CONFIRMED, CANDIDATE], "2 RSOs, 1 candidate"),
+        ([CANDIDATE, CANDIDATE], "no confirmed RSO, 2 candidates"),
+    ],
+)
+def test_the_summary_tells_confirmed_rsos_from_candidates(statuses: list[int], words: str):
+    rows = np.zeros(len(statuses), DETECTION_DTYPE)
+    rows["status"] = statuses
+    assert summary(result(detections=rows)) == words
 
 
 def test_without_a_star_field_the_rso_is_still_drawn():
@@ -231,7 +284,7 @@ def test_an_rso_in_a_corner_keeps_its_label_inside(corner: tuple[int, int]):
     mask = red(annotate(dark(), found))
     inside = slice(24, None) if corner[1] == 0 else slice(None)  # the caption lies over the top
     text = pixels(mask[inside])
-    # The label's 16 characters are some 100 px wide, the box 9.
+    # The label's 20 characters are some 130 px wide, the box 9.
     reach = text[:, 0].max() - text[:, 0].min() if len(text) else 0
     if corner[1]:
         assert reach > 80

@@ -11,7 +11,7 @@ import pytest
 
 from ofsat_ros.detection import CANDIDATE, CONFIRMED, DETECTION_DTYPE
 from ofsat_ros.pipeline import FrameResult
-from ofsat_ros.results import ResultWriter, detection_lines
+from ofsat_ros.results import ResultWriter, detection_lines, in_words
 from ofsat_ros.star_field import StarFieldMotion
 
 STAMP = 1_767_225_600_123_456_789
@@ -223,3 +223,16 @@ def test_a_second_file_that_cannot_be_written_leaves_none_open(tmp_path: Path):
     (tmp_path / "star_field.csv").mkdir()
     with pytest.raises(OSError, match=r"star_field\.csv"):
         ResultWriter(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("counts", "words"),
+    [
+        ({}, "0 RSO detections"),
+        ({0: 4}, "4 RSO detections"),
+        ({0: 4, 7: 1}, "5 RSO detections of 1 track and 4 candidates"),
+        ({7: 2, 9: 3}, "5 RSO detections of 2 tracks"),
+    ],
+)
+def test_counts_tell_tracks_from_candidates(counts: dict[int, int], words: str):
+    assert in_words(counts) == words

@@ -23,6 +23,8 @@ _REACH_PX = 3.0
 # Its flux may differ by this factor.
 _FLUX_RATIO = 2.5
 _LEAST_FRAMES = 3
+# Frames in which it may have been missed, and how many must have it for each of those.
+_MOST_MISSES, _HITS_PER_MISS = 3, 2
 # What centroids scatter by beyond their stated std: blends, pixel phase, px.
 _CENTROID_FLOOR_PX = 0.02
 # Registration and shape may move what Lucas-Kanade measures by this much, px.
@@ -131,6 +133,9 @@ def find_drifting(history: History, log_limit: float) -> list[Drift]:
     drift = speed * np.max(np.where(found, -times, 0), axis=1)
     log_false = np.log(long_enough.size) - significance**2 / 2
     suspect = (chains.count >= _LEAST_FRAMES) & (log_false < log_limit)
+    oldest = np.max(np.where(found, np.arange(1, len(earlier) + 1), 0), axis=1)
+    hits = found.sum(axis=1)
+    suspect &= hits >= _HITS_PER_MISS * (oldest - hits)
     suspect &= (drift > _LEAST_DRIFT_PX) & (drift > 3.5 * rms)
     suspect &= rms < np.maximum(0.3, 3 * error)
     suspect &= frame.contains(_xy(objects), _HALF_PX + 1)
@@ -166,7 +171,7 @@ def _chains(frame: PastFrame, earlier: list[PastFrame]) -> tuple[_Chains, NDArra
         distance, nearest = KDTree(other.object_sky).query(
             expected, distance_upper_bound=_REACH_PX
         )
-        near = np.flatnonzero((distance < _REACH_PX) & (misses <= 1))
+        near = np.flatnonzero((distance < _REACH_PX) & (misses <= _MOST_MISSES))
         there = nearest[near]
         ratio = other.objects["flux"][there] / np.maximum(objects["flux"][near], 1e-9)
         alike = (ratio < _FLUX_RATIO) & (ratio > 1 / _FLUX_RATIO) & ~other.objects["edge"][there]

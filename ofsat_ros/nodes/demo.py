@@ -7,12 +7,14 @@ with a summary.  It joins no ROS graph: it starts the others and ends them, what
 from __future__ import annotations
 
 import argparse
+import csv
 import os
 import signal
 import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,7 +22,7 @@ from pathlib import Path
 import ofsat_ros
 from ofsat_ros.nodes.recorder import BAG, HEARING
 from ofsat_ros.recordings import COMPRESSED_IMAGE, Bag, RecordingError
-from ofsat_ros.results import DETECTIONS
+from ofsat_ros.results import DETECTIONS, in_words
 
 _START_S = 30.0
 # Without a new line from anybody for so long, a frame will not be answered any more.
@@ -209,9 +211,10 @@ def _sum_up(output: Path, count: int) -> int:
     """Print what came of it; return 0 if every frame was answered once."""
     with Bag(output / BAG) as bag:
         answered = bag.topics["/rso_detections"].count
-    found = len((output / DETECTIONS).read_text().splitlines()) - 1
+    with (output / DETECTIONS).open(encoding="utf-8") as file:
+        found = Counter(int(row["track_id"]) for row in csv.DictReader(file))
     print(
-        f"demo: {count} frames played, {answered} answered, {found} RSO detections;"
+        f"demo: {count} frames played, {answered} answered, {in_words(found)};"
         f" the files are in {output}"
     )
     return 0 if answered == count else 1

@@ -1,7 +1,7 @@
-"""The detector node: images in, RSO detections out; a shell around ``pipeline.Pipeline``.
+"""The detector node: images in, RSOs and their tracks out; a shell around ``pipeline.Pipeline``.
 
 Its callbacks only take messages in; one worker thread processes and publishes, so that every
-frame it takes is answered once, in order: by an empty cloud if it could not be processed.
+frame it takes is answered once, in order: by empty clouds if it could not be processed.
 With ``reliable_input`` every frame of the sender is answered; a live camera's frames (best effort)
 may wait for ``backlog_s``, and then only the newest is.  Topics, fields and units: README.
 """
@@ -42,6 +42,7 @@ from ofsat_ros.nodes.runtime import (
 )
 from ofsat_ros.parameters import DEFAULT_PRESET, DetectorParameters, Parameters, Table
 from ofsat_ros.pipeline import FrameResult, ImageError, Pipeline
+from ofsat_ros.tracking import TRACK_DTYPE
 
 # Results are small; a subscriber may be this far behind and lose none.
 _RESULTS_DEPTH = 100
@@ -77,6 +78,7 @@ class Detector(Node):
         self._create_publishers()
         self._images = self._subscribe(own)
         self._image_publishers = 0
+        self._elsewhere: list[str] = []  # other topics with images, if nobody publishes ours
         self._health = Health(self._images.topic_name, own.reliable_input, profile_path())
         self._said_silence = False
         self._drawn: tuple[Header, float] | None = None  # markers that are to be seen, since when
@@ -104,6 +106,7 @@ class Detector(Node):
             )
 
         self._detections = publisher(PointCloud2, "rso_detections", _RESULTS_DEPTH)
+        self._tracks = publisher(PointCloud2, "rso_tracks", _RESULTS_DEPTH)
         self._markers = publisher(MarkerArray, "flow_markers", _RESULTS_DEPTH)
         self._motion = publisher(Vector3Stamped, "star_field_motion", _RESULTS_DEPTH)
         self._annotated = publisher(Image, "image_annotated", _PICTURES_DEPTH)
@@ -157,6 +160,9 @@ class Detector(Node):
             message, received_s = item
             try:
                 self._answer(message, received_s)
+                # Each frame's own numbers; those of the timer go on when no image comes.
+                if self._diagnostics.get_subscription_count():
+                    self._publish_diagnostics()
             # Nothing that is drawn or sent may end the thread, and with it all answers.
             except Exception:  # noqa: BLE001
                 if self._closed:
@@ -176,8 +182,8 @@ class Detector(Node):
         # Whatever an image does to the stages, it must not take the node down.
         except Exception as error:  # noqa: BLE001
             self.get_logger().error(traceback.format_exc())
-            self._pipeline.reset("an error in the frame before")
             self._fail(message.header, f"{type(error).__name__}: {error}")
+            self._pipeline.reset("an error in the frame before")
         else:
             self._publish(message.header, image, result, scale)
             self._health.processed(result, time.monotonic() - received_s)
@@ -188,8 +194,7 @@ class Detector(Node):
         self.get_logger().warning(
             f"image not processed: {why}", throttle_duration_sec=_WARN_EVERY_S
         )
-        none = np.zeros(0, DETECTION_DTYPE)
-        self._detections.publish(messages.detections_cloud(header, none))
+        self._publish_clouds(header, np.zeros(0, DETECTION_DTYPE), np.zeros(0, TRACK_DTYPE))
         self._motion.publish(messages.star_field_vector(header, None))
         self._markers.publish(messages.no_flow_markers(header))
         self._drawn = None
@@ -197,7 +202,7 @@ class Detector(Node):
     def _publish(
         self, header: Header, image: np.ndarray, result: FrameResult, scale: float
     ) -> None:
-        self._detections.publish(messages.detections_cloud(header, result.detections))
+        self._publish_clouds(header, result.detections, result.tracks)
         self._motion.publish(messages.star_field_vector(header, result))
         if self._markers.get_subscription_count():
             self._markers.publish(messages.flow_markers(header, result, scale))
@@ -206,10 +211,15 @@ class Detector(Node):
             picture = report.annotate(image, result, scale=scale)
             self._annotated.publish(messages.image_message(header, picture))
 
+    def _publish_clouds(self, header: Header, detections: np.ndarray, tracks: np.ndarray) -> None:
+        self._detections.publish(messages.detections_cloud(header, detections))
+        self._tracks.publish(messages.tracks_cloud(header, tracks))
+
     def _tick(self) -> None:
         """Do once a second what does not depend on images."""
         try:
             self._clear_stale_markers()
+            self._look_around()
             self._publish_diagnostics()
         # To say how it is must not end what works.
         except Exception:  # noqa: BLE001
@@ -226,14 +236,16 @@ class Detector(Node):
         self._drawn = None
         self._markers.publish(messages.no_flow_markers(drawn[0]))
 
-    def _publish_diagnostics(self) -> None:
+    def _look_around(self) -> None:
         self._image_publishers = self.count_publishers(self._images.topic_name)
+        self._elsewhere = [] if self._image_publishers else self._other_image_topics()
+        self._say_aloud()
+
+    def _publish_diagnostics(self) -> None:
         timeout_s = self._settings[DetectorParameters].no_image_timeout_s
-        elsewhere = [] if self._image_publishers else self._other_image_topics()
-        self._say_aloud(timeout_s, elsewhere)
         status = messages.diagnostic(
             f"{self.get_fully_qualified_name()}: detection",
-            self._health.problems(self._image_publishers, timeout_s, elsewhere),
+            self._health.problems(self._image_publishers, timeout_s, self._elsewhere),
             self._health.summary(),
             self._health.values(),
         )
@@ -250,11 +262,14 @@ class Detector(Node):
             if kind in kinds and name != self._annotated.topic_name and self.count_publishers(name)
         ]
 
-    def _say_aloud(self, timeout_s: float, elsewhere: list[str]) -> None:
+    def _say_aloud(self) -> None:
         """Log what a user must know who does not watch ``/diagnostics``."""
+        timeout_s = self._settings[DetectorParameters].no_image_timeout_s
         silent = self._health.enabled and self._health.silence_s() > timeout_s
         if silent and not self._said_silence:
-            self.get_logger().warning(self._health.silence(self._image_publishers, elsewhere))
+            self.get_logger().warning(
+                self._health.silence(self._image_publishers, self._elsewhere)
+            )
         self._said_silence = silent
         if losses := self._health.losses():
             self.get_logger().warning(losses, throttle_duration_sec=_WARN_EVERY_S)

@@ -12,7 +12,12 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
+from ofsat_ros import report
+from ofsat_ros.detection import CONFIRMED
 from ofsat_ros.pipeline import FrameResult
+from ofsat_ros.tracking import COASTING
 
 # s; a loss is a warning for so long, and rates are taken over it.
 _RECENT_S = 10.0
@@ -159,34 +164,16 @@ class Health:
             result = self._result
         if result is None:
             return "waiting for images"
-        return result.reason or f"{len(result.detections)} RSOs"
+        return report.summary(result)
 
     def values(self) -> dict[str, Any]:
-        """Return names and values for ``/diagnostics``."""
+        """Return names and values for ``/diagnostics``: counts, and what the last frame gave."""
         values: dict[str, Any] = {}
         with self._lock:
             values |= {f"frames_{key}": count for key, count in self._counts.items()}
             values |= {"rate_hz": self._rate_hz(), "latency_s": self._latency_s}
             result = self._result
-        if result is None:
-            return values
-        field = result.star_field
-        moving = field is not None
-        return values | {
-            "objects": len(result.objects),
-            "stars": field.star_count if moving else 0,
-            "rso_detections": len(result.detections),
-            "noise_dn": result.noise,
-            "background_dn": result.background,
-            "threshold_dn": result.threshold,
-            "star_motion_x_px_s": field.displacement[0] / result.dt_s if moving else float("nan"),
-            "star_motion_y_px_s": field.displacement[1] / result.dt_s if moving else float("nan"),
-            "star_rotation_rad_s": field.rotation / result.dt_s if moving else float("nan"),
-            "star_residual_px": field.residual_px if moving else float("nan"),
-            "frame_interval_s": result.dt_s,
-            "processing_s": sum(result.seconds.values()),
-            "nothing_detected_because": result.reason,
-        }
+        return values if result is None else values | _frame_values(result)
 
     def _rate_hz(self) -> float:
         now = time.monotonic()
@@ -200,6 +187,37 @@ class Health:
             "start the camera driver with"
             f" FASTRTPS_DEFAULT_PROFILES_FILE={self._profile} (the sender's setting decides)"
         )
+
+
+def _frame_values(result: FrameResult) -> dict[str, Any]:
+    confirmed = int(np.count_nonzero(result.detections["status"] == CONFIRMED))
+    field = result.star_field
+    # x px, y px, rotation rad
+    motion = np.full(3, np.nan) if field is None else [*field.displacement, field.rotation]
+    rate = np.divide(motion, result.dt_s)
+    return {
+        "frame": result.frame,
+        "stamp_ns": result.stamp_ns,
+        "objects": len(result.objects),
+        "stars": field.star_count if field else 0,
+        "spots": result.spot_count,
+        "rso_confirmed": confirmed,
+        "rso_candidates": len(result.detections) - confirmed,
+        "tracks": len(result.tracks),
+        "tracks_coasting": int(np.count_nonzero(result.tracks["status"] == COASTING)),
+        "noise_dn": result.noise,
+        "background_dn": result.background,
+        "threshold_dn": result.threshold,
+        "star_motion_x_px": motion[0],
+        "star_motion_y_px": motion[1],
+        "star_motion_x_px_s": rate[0],
+        "star_motion_y_px_s": rate[1],
+        "star_rotation_rad_s": rate[2],
+        "star_residual_px": field.residual_px if field else float("nan"),
+        "frame_interval_s": result.dt_s,
+        "processing_s": sum(result.seconds.values()),
+        "nothing_detected_because": result.reason,
+    }
 
 
 def _relative(topic: str) -> str:

@@ -11,6 +11,7 @@ import math
 import struct
 import sys
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -21,8 +22,9 @@ from sensor_msgs.msg import Image, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from ofsat_ros.detection import DETECTION_DTYPE
+from ofsat_ros.detection import CONFIRMED, DETECTION_DTYPE
 from ofsat_ros.pipeline import FrameResult
+from ofsat_ros.tracking import COASTING, TRACK_DTYPE
 
 _NS = 1_000_000_000
 _STAMP_BYTES = 8
@@ -39,6 +41,13 @@ CLOUD_DTYPE = np.dtype(
     + [("id", "u4"), ("ra", "f8"), ("dec", "f8"), ("status", "u1")],
     align=True,
 )
+# One row of rso_tracks: the same, and what only a track has.
+TRACK_CLOUD_DTYPE = np.dtype(
+    [(name, dtype) for name, (dtype, _) in CLOUD_DTYPE.fields.items()]
+    + [(name, "f8") for name in ("sigma_u_rate", "sigma_v_rate", "age")]
+    + [(name, "u4") for name in ("hits", "misses")],
+    align=True,
+)
 _POINT_TYPES = {
     "i1": PointField.INT8,
     "u1": PointField.UINT8,
@@ -50,10 +59,6 @@ _POINT_TYPES = {
     "f8": PointField.FLOAT64,
 }
 _DTYPES = {code: name for name, code in _POINT_TYPES.items()}
-_FIELDS = [
-    PointField(name=name, offset=offset, datatype=_POINT_TYPES[dtype.str[1:]], count=1)
-    for name, (dtype, offset) in CLOUD_DTYPE.fields.items()
-]
 _DETECTION_FIELDS = {
     "u": "x",
     "v": "y",
@@ -72,11 +77,21 @@ _DETECTION_FIELDS = {
     "dec": "dec",
     "status": "status",
 }
+_TRACK_FIELDS = _DETECTION_FIELDS | {
+    "sigma_u_rate": "sigma_vx",
+    "sigma_v_rate": "sigma_vy",
+    "age": "age",
+    "hits": "hits",
+    "misses": "misses",
+}
 
 _BLUE = ColorRGBA(r=0.2, g=0.5, b=1.0, a=1.0)
 _RED = ColorRGBA(r=1.0, g=0.15, b=0.1, a=1.0)
+_YELLOW = ColorRGBA(r=1.0, g=0.85, b=0.2, a=1.0)
 # px; half the side of the box around an RSO, beyond half its streak.
 _BOX_MARGIN_PX = 8.0
+# Part of a side that the corner of an open box is long.
+_CORNER = 0.3
 _LINE_WIDTH_PX = 1.0
 _TEXT_HEIGHT_PX = 12.0
 
@@ -134,26 +149,26 @@ def image_message(header: Header, image: np.ndarray) -> Image:
     )
 
 
-def cloud_rows(count: int) -> np.ndarray:
-    """Return `count` rows of CLOUD_DTYPE in which everything is unknown."""
-    rows = np.zeros(count, CLOUD_DTYPE)
-    for name in CLOUD_DTYPE.names:
-        if CLOUD_DTYPE[name].kind == "f":
+def cloud_rows(count: int, dtype: np.dtype = CLOUD_DTYPE) -> np.ndarray:
+    """Return `count` rows of a cloud in which everything is unknown."""
+    rows = np.zeros(count, dtype)
+    for name in dtype.names:
+        if dtype[name].kind == "f":
             rows[name] = np.nan
     return rows
 
 
 def cloud_message(header: Header, rows: np.ndarray) -> PointCloud2:
-    """Return rows of CLOUD_DTYPE as a cloud of one row; an empty one is a message, too."""
+    """Return rows of a cloud as a message of one row; an empty one is a message, too."""
     known = all(np.isfinite(rows[axis]).all() for axis in "xyz")
     return PointCloud2(
         header=header,
         height=1,
         width=len(rows),
-        fields=_FIELDS,
+        fields=_point_fields(rows.dtype),
         is_bigendian=sys.byteorder == "big",
-        point_step=CLOUD_DTYPE.itemsize,
-        row_step=CLOUD_DTYPE.itemsize * len(rows),
+        point_step=rows.itemsize,
+        row_step=rows.nbytes,
         data=_bytes_array(rows),
         is_dense=known,
     )
@@ -162,12 +177,18 @@ def cloud_message(header: Header, rows: np.ndarray) -> PointCloud2:
 def detections_cloud(header: Header, detections: np.ndarray) -> PointCloud2:
     """Return the RSO detections of a frame (DETECTION_DTYPE) as ``rso_detections``.
 
+    Confirmed ones bear their track's id, candidates 0.  Lines of sight are NaN: there is no
+    calibration.
+    """
+    return _cloud(header, detections, CLOUD_DTYPE, _DETECTION_FIELDS)
+
+
+def tracks_cloud(header: Header, tracks: np.ndarray) -> PointCloud2:
+    """Return the tracks of a frame (TRACK_DTYPE) as ``rso_tracks``, coasting ones included.
+
     Lines of sight are NaN: there is no calibration.
     """
-    rows = cloud_rows(len(detections))
-    for field, column in _DETECTION_FIELDS.items():
-        rows[field] = detections[column]
-    return cloud_message(header, rows)
+    return _cloud(header, tracks, TRACK_CLOUD_DTYPE, _TRACK_FIELDS)
 
 
 def detections_array(cloud: PointCloud2) -> np.ndarray:
@@ -180,14 +201,24 @@ def detections_array(cloud: PointCloud2) -> np.ndarray:
     MessageError
         If the message is no such cloud.
     """
-    points = cloud_array(cloud)
-    if missing := _DETECTION_FIELDS.keys() - set(points.dtype.names or ()):
-        raise MessageError(f"the cloud has no field {', '.join(sorted(missing))}")
-    rows = np.zeros(len(points), DETECTION_DTYPE)
+    rows = _rows(cloud, DETECTION_DTYPE, _DETECTION_FIELDS)
     rows["significance"] = np.nan
     rows["object_index"] = rows["flow_index"] = -1
-    for field, column in _DETECTION_FIELDS.items():
-        rows[column] = points[field]
+    return rows
+
+
+def tracks_array(cloud: PointCloud2) -> np.ndarray:
+    """Return the tracks of an ``rso_tracks`` message as TRACK_DTYPE.
+
+    Columns that the message does not carry are NaN.
+
+    Raises
+    ------
+    MessageError
+        If the message is no such cloud.
+    """
+    rows = _rows(cloud, TRACK_DTYPE, _TRACK_FIELDS)
+    rows["log_false"] = np.nan
     return rows
 
 
@@ -239,7 +270,9 @@ def flow_markers(header: Header, result: FrameResult, scale: float) -> MarkerArr
 
     Every array begins by deleting what was drawn before.  Namespaces: ``star_flow`` (blue) and
     ``rso_flow`` (red), each one LINE_LIST of vectors that begin where the object is and are one
-    frame's displacement times `scale`; ``rso_boxes`` and ``rso_ids``, one marker per detection.
+    frame's displacement times `scale`; ``rso_boxes``, one marker per detection, closed around a
+    confirmed RSO and only its corners around a candidate; ``coasting_boxes`` (yellow), one per
+    track that is only expected there; ``rso_ids``, one per confirmed RSO and coasting track.
 
     Parameters
     ----------
@@ -257,7 +290,15 @@ def flow_markers(header: Header, result: FrameResult, scale: float) -> MarkerArr
     step = np.column_stack([rows["vx"], rows["vy"]]) * result.dt_s
     array_.markers += _vectors(header, "rso_flow", _RED, start, step * scale)
     for number, row in enumerate(rows):
-        array_.markers += _box(header, number, row)
+        confirmed = row["status"] == CONFIRMED
+        array_.markers.append(_box(header, "rso_boxes", number, row, _RED, confirmed))
+        if confirmed:
+            label = f"{row['track_id']}  SNR {row['snr']:.0f}"
+            array_.markers.append(_id(header, row, label, _RED))
+    for row in result.tracks[result.tracks["status"] == COASTING]:
+        number = int(row["track_id"])
+        array_.markers.append(_box(header, "coasting_boxes", number, row, _YELLOW, True))
+        array_.markers.append(_id(header, row, f"{number}  coasting", _YELLOW))
     return array_
 
 
@@ -285,6 +326,35 @@ def diagnostic(
         message="; ".join(problems) or summary,
         values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()],
     )
+
+
+def _cloud(
+    header: Header, array_: np.ndarray, dtype: np.dtype, columns: Mapping[str, str]
+) -> PointCloud2:
+    """A cloud whose fields are an array's columns; what the array does not hold is unknown."""
+    rows = cloud_rows(len(array_), dtype)
+    for field, column in columns.items():
+        rows[field] = array_[column]
+    return cloud_message(header, rows)
+
+
+def _rows(cloud: PointCloud2, dtype: np.dtype, columns: Mapping[str, str]) -> np.ndarray:
+    """The array whose columns are a cloud's fields; MessageError if one is missing."""
+    points = cloud_array(cloud)
+    if missing := columns.keys() - set(points.dtype.names or ()):
+        raise MessageError(f"the cloud has no field {', '.join(sorted(missing))}")
+    rows = np.zeros(len(points), dtype)
+    for field, column in columns.items():
+        rows[column] = points[field]
+    return rows
+
+
+@cache
+def _point_fields(dtype: np.dtype) -> list[PointField]:
+    return [
+        PointField(name=name, offset=offset, datatype=_POINT_TYPES[kind.str[1:]], count=1)
+        for name, (kind, offset) in dtype.fields.items()
+    ]
 
 
 def _text(value: Any) -> str:
@@ -319,18 +389,30 @@ def _vectors(
     return [marker]
 
 
-def _box(header: Header, number: int, row: np.void) -> list[Marker]:
-    """A square around a detection, and its id above; an unconfirmed one has none."""
-    u, v = float(row["x"]), float(row["y"])
-    half = _BOX_MARGIN_PX + float(np.nan_to_num(row["length"])) / 2
-    corners = [(u + half * i, v + half * j) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    box = _marker(header, "rso_boxes", number, Marker.LINE_LIST, _RED)
+def _box(
+    header: Header, namespace: str, number: int, row: np.void, color: ColorRGBA, closed: bool
+) -> Marker:
+    """A square around a place, or only its corners."""
+    centre, half = np.array([row["x"], row["y"]]), _half_side(row)
+    corners = centre + half * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    box = _marker(header, namespace, number, Marker.LINE_LIST, color)
     box.scale.x = _LINE_WIDTH_PX
-    for side in range(4):
-        for x, y in (corners[side], corners[(side + 1) % 4]):
-            box.points.append(Point(x=x, y=y))
-    text = _marker(header, "rso_ids", number, Marker.TEXT_VIEW_FACING, _RED)
+    for here, there in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        bit = _CORNER * (there - here)
+        ends = [here, there] if closed else [here, here + bit, there - bit, there]
+        box.points += [Point(x=x, y=y) for x, y in np.array(ends).tolist()]
+    return box
+
+
+def _id(header: Header, row: np.void, label: str, color: ColorRGBA) -> Marker:
+    """A text over the box of what has an id."""
+    text = _marker(header, "rso_ids", int(row["track_id"]), Marker.TEXT_VIEW_FACING, color)
     text.scale.z = _TEXT_HEIGHT_PX
-    text.pose.position.x, text.pose.position.y = u, v - half - _TEXT_HEIGHT_PX / 2
-    text.text = f"{row['track_id'] or '?'}  SNR {row['snr']:.0f}"
-    return [box, text]
+    text.pose.position.x = float(row["x"])
+    text.pose.position.y = float(row["y"]) - _half_side(row) - _TEXT_HEIGHT_PX / 2
+    text.text = label
+    return text
+
+
+def _half_side(row: np.void) -> float:
+    return _BOX_MARGIN_PX + float(np.nan_to_num(row["length"])) / 2

@@ -10,7 +10,7 @@ import math
 import sys
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -30,7 +30,7 @@ from ofsat_ros.nodes.ros_parameters import NodeParameters
 from ofsat_ros.nodes.runtime import StartError, overridable_qos, parser_of, reliable, run
 from ofsat_ros.parameters import RecorderParameters
 from ofsat_ros.recordings import BagWriter, RecordingError
-from ofsat_ros.results import DETECTION_COLUMNS, DETECTIONS, detection_lines
+from ofsat_ros.results import DETECTION_COLUMNS, DETECTIONS, detection_lines, in_words
 
 BAG, PICTURE = "results", "frame_{:06d}.png"
 HEARING = "hearing a detector"  # printed as soon as this is so
@@ -84,7 +84,8 @@ class Recorder(Node):
         except (OSError, RecordingError) as error:
             raise StartError(str(error)) from error
         self._table = _Table()
-        self._frames = self._detections = self._pictures = 0
+        self._frames = self._pictures = 0
+        self._detections: Counter[int] = Counter()  # of each track, 0 for candidates
         self._recent: deque[tuple[int, int]] = deque(maxlen=_DEPTH)  # stamp, frame
         self._last_frame_s = math.inf
         self._hears = False
@@ -110,7 +111,7 @@ class Recorder(Node):
         if self.exit_code:
             return
         _say(
-            f"{self._frames} frames, {self._detections} RSO detections; {DETECTIONS},"
+            f"{self._frames} frames, {in_words(self._detections)}; {DETECTIONS},"
             f" {self._pictures} pictures and the bag {BAG} are in {self._folder}"
         )
 
@@ -130,6 +131,7 @@ class Recorder(Node):
             return subscription.topic_name
 
         self._cloud_topic = subscribe(PointCloud2, "rso_detections", self._on_detections)
+        self._tracks_topic = subscribe(PointCloud2, "rso_tracks", self._on_tracks)
         self._motion_topic = subscribe(Vector3Stamped, "star_field_motion", self._on_motion)
         self._marker_topic = subscribe(MarkerArray, "flow_markers", self._on_markers)
         if self._own.picture_every:
@@ -167,8 +169,13 @@ class Recorder(Node):
             self._table.add(stamp, self._frames, rows)
             self._recent.append((stamp, self._frames))
             self._frames += 1
-            self._detections += len(rows)
+            self._detections.update(rows["track_id"].tolist())
             self._last_frame_s = time.monotonic()
+
+    def _on_tracks(self, data: bytes) -> None:
+        with self._lock:
+            stamp = messages.header_stamp_ns(data)
+            self._write(self._tracks_topic, "sensor_msgs/msg/PointCloud2", data, stamp)
 
     def _on_motion(self, data: bytes) -> None:
         with self._lock:

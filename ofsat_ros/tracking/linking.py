@@ -82,7 +82,7 @@ class Sighting:
 
     @property
     def expected(self) -> Array:
-        """How many spots of at least each spot's strength chance gives in such a frame, (N,).
+        """How many telling spots of at least each spot's strength chance gives in a frame, (N,).
 
         The peaks of smoothed white noise (Adler, "The geometry of random fields", 1981, for a
         Gaussian of sigma 1 px), and as many again as the frame has stronger ones, since no real
@@ -91,7 +91,8 @@ class Sighting:
         height, width = self.frame.shape
         excess = self.spots["excess"]
         peaks = (2 * np.pi) ** -1.5 / 2 * excess * np.exp(-(excess**2) / 2)
-        stronger = np.argsort(np.argsort(-excess, kind="stable"), kind="stable")
+        strongest = np.sort(excess[self.telling])
+        stronger = len(strongest) - np.searchsorted(strongest, excess, side="right")
         return peaks * height * width + stronger + 1
 
     @property
@@ -167,7 +168,9 @@ class _Paths:
         self._xy = newest.sky[a] + other.sky[b]
         self._txy = other.sky[b] * t
         self._span = np.full(len(a), -t)
-        self._frames = np.full(len(a), 2)
+        # Frames in which a path could be seen, and those of them up to its oldest spot.
+        self._visible = np.full(len(a), 2)
+        self._since_first = np.full(len(a), 2)
         height, width = newest.frame.shape
         reach = np.hypot(*(newest.sky[a] - other.sky[b]).T)
         area = _SCALES * np.pi * reach**2 / (height * width)
@@ -220,7 +223,7 @@ class _Paths:
         rows = np.full(len(places), -1, np.intp)
         self._rows[other.frame.number] = rows
         visible = other.frame.contains(places, 3.5)
-        self._frames += visible
+        self._visible += visible
         free = np.flatnonzero(other.free)
         seen = np.flatnonzero(visible)
         if not (free.size and seen.size):
@@ -249,12 +252,18 @@ class _Paths:
         self._xy[seen] += other.sky[spot]
         self._txy[seen] += t * other.sky[spot]
         self._span[seen] = np.maximum(self._span[seen], -t)
+        self._since_first[seen] = self._visible[seen]
 
     def surest(self, log_limit: float) -> list[tuple[float, dict[int, int]]]:
         """Paths that chance explains less often than the limit, with their spots."""
-        n, k = self._frames, self._count
-        # In which of the frames the spots are is another choice that chance had.
-        choices = gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1)
+        k, n = self._count, self._since_first
+        # When it began, and in which frames between it was missed, is what chance could choose.
+        choices = (
+            gammaln(n - 1)
+            - gammaln(k - 1)
+            - gammaln(n - k + 1)
+            + np.log(np.maximum(self._visible - 2, 1))
+        )
         log_false = self._log_false + choices
         way = np.hypot(*self._velocity().T) * self._span
         error = self._spread() / np.sqrt(self._time_spread()) * self._span

@@ -18,7 +18,7 @@ _FLOOR_PX = 0.05
 # Along a streak, a centroid may be off by this part of its length, and once refined by this.
 _STREAK_SPREAD, _REFINED_SPREAD = 0.12, 0.01
 # Hits over which a velocity is fitted, and over which a track must have moved.
-_FIT_HITS, _WAY_HITS = 7, 5
+_FIT_HITS, _WAY_HITS = 9, 5
 # What stays within this way on the sky is a star, px; nor is it motion if it may be chance.
 _LEAST_WAY_PX, _WAY_SIGMAS = 1.0, 4.0
 # Logarithm of how much less likely a miss makes a track.

@@ -99,7 +99,7 @@ class Tracker:
 
         The ids are not used again.
         """
-        settled = self._settle(history, len(history))
+        settled = self.settle(history, len(history))
         self._tracks, self._ended, self._sightings = [], [], []
         return settled
 
@@ -154,14 +154,14 @@ class Tracker:
         rows = [track_row(track, history) for track in self._tracks]
         # The oldest frame makes room for the next one.
         full = len(history) == history.length
-        settled = self._settle(history, 1) if full else []
+        settled = self.settle(history, 1) if full else []
         for track in self._tracks:
             track.forget(oldest - history.length)
         self._ended = [track for track in self._ended if max(track.hits) > oldest]
         return Tracked(np.array(now, DETECTION_DTYPE), np.array(rows, TRACK_DTYPE), settled)
 
-    def _settle(self, history: History, count: int) -> list[Settled]:
-        """Say the last word of the oldest frames that it was not said of before."""
+    def settle(self, history: History, count: int) -> list[Settled]:
+        """Say the last word on the oldest frames, this many, that it was not said of before."""
         settled = []
         for frame in list(history)[:count]:
             if frame.number < self._next_to_settle:
