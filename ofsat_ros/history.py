@@ -40,8 +40,8 @@ class PastFrame:
         Its number in the pipeline.
     stamp_ns : int
         Its stamp, ns UTC.
-    image, smoothed : (H, W) float32
-        The image less its background, and its smoothed version, DN.
+    smoothed : (H, W) float32
+        The smoothed image less its background, DN.
     noise : float
         Std of the background in `smoothed`, DN.
     noise_ratio : (ny, nx) float32
@@ -56,7 +56,6 @@ class PastFrame:
 
     number: int
     stamp_ns: int
-    image: Plane
     smoothed: Plane
     noise: float
     noise_ratio: Plane

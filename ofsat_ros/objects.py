@@ -188,18 +188,21 @@ def _parts(
         at = labels[peaks[:, 0], peaks[:, 1]]
         for fainter in np.flatnonzero((height > level) & (valley == 0)):
             if fainter and np.any(at[:fainter] == at[fainter]):
-                valley[fainter] = level
+                # Somewhere between this level and the one before.
+                valley[fainter] = level * _LEVEL_STEP
                 needed = max(_PROMINENCE_SIGMAS * noise, _PROMINENCE_RATIO * height[fainter])
-                alive[fainter] = height[fainter] - level > needed
+                alive[fainter] = height[fainter] - valley[fainter] > needed
         level /= _LEVEL_STEP
     if np.count_nonzero(alive) < 2:
         return None
+    # The flood leaves out the border of its image.
+    light, peaks = np.pad(light, 1), peaks + 1
     markers = np.where(light > 0, 0, len(peaks) + 1).astype(np.int32)
     for part, (row, column) in enumerate(peaks[alive], start=1):
         markers[row, column] = part
     grey = 255 * (1 - np.log1p(light / noise) / np.log1p(height[0] / noise))
     flood = cv2.watershed(np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2), markers)
-    return np.where((flood > 0) & (flood <= len(peaks)), flood, 0)
+    return np.where((flood > 0) & (flood <= len(peaks)), flood, 0)[1:-1, 1:-1]
 
 
 def _moments(

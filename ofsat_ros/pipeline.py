@@ -347,7 +347,6 @@ class Pipeline:
             PastFrame(
                 number=result.frame,
                 stamp_ns=result.stamp_ns,
-                image=pre.image,
                 smoothed=pre.smoothed,
                 noise=pre.noise,
                 noise_ratio=pre.noise_ratio,

@@ -287,7 +287,7 @@ def sequence(star_v, rso_v, dtype, frames=3, dt_s=2.0, exposure_s=0.0, seed=1, s
 
 
 def process(images, dt_s, **changes):
-    pipeline = Pipeline(Parameters.preset("robust", **changes))
+    pipeline = Pipeline(Parameters.preset("robust", rso_test="vector", **changes))
     return [pipeline.process(image, round(k * dt_s * 1e9)) for k, image in enumerate(images)]
 
 

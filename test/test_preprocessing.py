@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.stats import norm
 
 from ofsat_ros.parameters import Parameters
-from ofsat_ros.preprocessing import Preprocessed, preprocess
+from ofsat_ros.preprocessing import Preprocessed, SensorMemory, preprocess
 
 PUBLISHED = {"background": "none", "threshold_statistics": "all", "hot_pixels": "keep"}
 # Smoothing lowers white noise to this for sigma 1 px: 1 / (2 sqrt(pi)), sampled on the grid.
@@ -412,3 +412,177 @@ def test_a_float_image_may_have_any_unit(scale: float):
     plain, scaled = run(image), run(image * np.float32(scale))
     assert np.mean(plain.mask != scaled.mask) < 1e-4
     assert scaled.noise == pytest.approx(plain.noise * scale, rel=1e-3)
+
+
+# What the sensor shows in every frame
+
+SENSOR = (128, 128)
+# Rows and columns on a grid; none touches another or the border.
+GRID = tuple(axis.ravel() for axis in np.mgrid[12:128:15, 12:128:15])
+
+
+def remember(
+    static: np.ndarray,
+    frames: int,
+    memory: SensorMemory | None = None,
+    seed: int = 1,
+    passing=None,
+) -> tuple[SensorMemory, Preprocessed]:
+    """Show a memory frames of a fixed pattern and noise; return the last preprocessed."""
+    memory = memory or SensorMemory()
+    for number in range(frames):
+        image = noise(static.shape, seed=1000 * seed + number) + static
+        if passing is not None:
+            image += passing(number)
+        pre = preprocess(counts(image), Parameters(), memory)
+    return memory, pre
+
+
+def pattern(*pixels: tuple[int, int, float]) -> np.ndarray:
+    """At each place of the grid, pixels one step (dy, dx) away hold this many DN."""
+    image = np.zeros(SENSOR)
+    for dy, dx, value in pixels:
+        image[GRID[0] + dy, GRID[1] + dx] = value
+    return image
+
+
+def field(sigma: float, flux: float, spacing: int = 25, shift: tuple[float, float] = (0, 0)):
+    """Point sources at all phases within the pixel, on a grid that has moved."""
+    image = np.zeros(SENSOR)
+    places = np.arange(20, 105, spacing)
+    for i, x in enumerate(places):
+        for j, y in enumerate(places):
+            sx, sy = x + i / len(places) + shift[0], y + j / len(places) + shift[1]
+            image += integrated_star(sx, sy, sigma, flux, SENSOR)
+    return image
+
+
+def test_the_memory_finds_hot_pixels_too_faint_for_one_frame():
+    """3 sigmas a frame: over 6 sigmas of the mean from the fifth frame on, surely by the 16th."""
+    hot = pattern((0, 0, 60))
+    _, first = remember(hot, 1)
+    assert first.defects == 0
+    assert first.image[GRID].mean() == pytest.approx(60, abs=7)
+    _, last = remember(hot, 16)
+    assert 0.97 * len(GRID[0]) <= last.defects <= 1.03 * len(GRID[0])
+    # Medians of eight neighbours stand there now: 20 DN of noise over some 2.3.
+    assert last.image[GRID].mean() == pytest.approx(0, abs=4)
+    assert last.image[GRID].std() < 12
+    # What is no defect stays as it is.
+    untouched = np.ones(SENSOR, bool)
+    untouched[GRID] = False
+    plain = run(counts(noise(SENSOR, seed=1015) + hot))
+    assert np.count_nonzero(last.image[untouched] != plain.image[untouched]) <= 3
+
+
+@pytest.mark.parametrize("second", [(0, 1), (1, 0), (1, 1), (-1, 1)])
+@pytest.mark.parametrize("level", [200, 20_000])
+def test_the_memory_finds_pairs_of_hot_pixels(second: tuple[int, int], level: float):
+    """Neither stands alone, so that one frame by itself would keep them."""
+    pair = pattern((0, 0, level), (*second, 0.9 * level))
+    alone = run(counts(noise(SENSOR) + pair))
+    assert alone.image[GRID].mean() > 0.9 * level
+    _, pre = remember(pair, 8)
+    assert pre.defects == pytest.approx(2 * len(GRID[0]), rel=0.03)
+    there = pre.image[pair > 0]
+    # Of the median's eight neighbours one is the other of the pair: it stands for less noise.
+    assert there.mean() == pytest.approx(0, abs=10)
+    assert there.max() < 4 * 20
+
+
+def test_the_memory_finds_what_leaks_from_a_saturated_pixel():
+    """0.5 % of the charge, in the pixel that is read out next: 15 sigmas; and 0.15 % sideways."""
+    leak = pattern((0, 0, 64_000), (1, 0, 300), (0, 1, 100))
+    alone = run(counts(noise(SENSOR) + leak))
+    assert alone.image[GRID[0] + 1, GRID[1]].mean() > 250
+    _, pre = remember(leak, 8)
+    for dy, dx in ((0, 0), (1, 0), (0, 1)):
+        assert pre.image[GRID[0] + dy, GRID[1] + dx].mean() == pytest.approx(0, abs=10)
+        assert pre.image[GRID[0] + dy, GRID[1] + dx].max() < 4 * 20
+    assert 3 * len(GRID[0]) <= pre.defects <= 3.1 * len(GRID[0])
+
+
+@pytest.mark.parametrize("sigma", [0.8, 1.0, 1.4, 2.0])
+@pytest.mark.parametrize("peak_sigmas", [3, 30, 1000])
+@pytest.mark.parametrize("stars", ["none", "points", "streaks"])
+def test_a_source_that_stands_still_in_the_sensor_is_no_defect(
+    sigma: float, peak_sigmas: float, stars: str
+):
+    """An RSO in rate tracking, and every star in sidereal tracking."""
+    unit = field(sigma, 1)
+    still = peak_sigmas * 20 * unit / unit.max()
+
+    def passing(number: int) -> np.ndarray:
+        light = np.zeros(SENSOR)
+        for step in range(8 if stars == "streaks" else 1):
+            x = (37 * number + 9) % 128 + step
+            y = (23 * number + 61) % 128 + step / 2
+            light += integrated_star(x, y, sigma, 40_000, SENSOR)
+        return light
+
+    _, pre = remember(still, 12, passing=None if stars == "none" else passing)
+    # The mean's own noise may make a pixel of a faint wide one stand out.
+    assert pre.defects <= (1 if peak_sigmas == 3 else 0)
+    # And nothing else takes a part of it.
+    assert pre.image[still > 0.8 * still.max()].mean() > 0.7 * still.max()
+
+
+def test_hot_pixels_are_found_among_stars_that_pass():
+    hot = pattern((0, 0, 100))
+    _, pre = remember(hot, 20, passing=lambda k: field(1.0, 4000, shift=(1.7 * k - 17, 0.9 * k)))
+    there = pre.image[GRID]
+    # Those in the trail of a star may have to wait.
+    assert np.mean(there < 60) > 0.8
+    assert pre.defects > 0.8 * len(GRID[0])
+
+
+def test_a_cosmic_ray_is_forgotten():
+    """One of 20 sigmas is a defect for that frame at most: the mean has lost it in the next."""
+    memory = SensorMemory()
+    struck = np.zeros(SENSOR)
+    struck[60, 60:63] = 400
+    remember(np.zeros(SENSOR), 10, memory)
+    remember(struck, 1, memory, seed=2)
+    _, pre = remember(np.zeros(SENSOR), 40, memory, seed=3)
+    assert pre.defects == 0
+    plain = run(counts(noise(SENSOR, seed=3039)))
+    assert np.array_equal(pre.image, plain.image)
+
+
+def test_another_size_starts_afresh():
+    memory, pre = remember(pattern((0, 0, 100)), 12)
+    assert pre.defects >= 60
+    _, other = remember(np.zeros((128, 130)), 1, memory)
+    assert other.defects == 0
+    # And back again: what was learned is gone.
+    _, back = remember(np.zeros(SENSOR), 1, memory)
+    assert back.defects == 0
+
+
+def test_the_memory_is_of_the_background_subtracted():
+    """Another background, another exposure: the pattern stays what it was."""
+    memory, _ = remember(pattern((0, 0, 100)), 8)
+    for level in (200, 9000):
+        image = counts(noise(SENSOR, level=level) + pattern((0, 0, 100)))
+        assert preprocess(image, Parameters(), memory).defects == pytest.approx(64, abs=3)
+
+
+def test_hot_pixels_are_kept_where_that_is_asked_for():
+    memory = SensorMemory()
+    image = counts(noise(SENSOR) + pattern((0, 0, 500)))
+    for _ in range(5):
+        pre = preprocess(image, Parameters(hot_pixels="keep"), memory)
+    assert pre.defects == 0
+    assert pre.image[GRID].mean() == pytest.approx(500, abs=10)
+    assert run(image).defects == 0
+
+
+def test_the_memory_does_not_change_the_image():
+    memory = SensorMemory()
+    image = (noise(SENSOR, level=0) + pattern((0, 0, 300))).astype(np.float32)
+    before = image.copy()
+    for _ in range(3):
+        rows, columns = memory.defects(image, 20.0)
+        # and what is beside them, over 6 sigmas by chance
+        assert {*zip(rows, columns, strict=True)} >= {*zip(*GRID, strict=True)}
+    assert np.array_equal(image, before)

@@ -48,8 +48,16 @@ _POINT_WIDTH_PX = 1.4
 # What moves less in a frame is no streak, nor what is shorter, px; a streak's half width, px.
 _WAY_PX, _LONGEST_POINT_PX, _ACROSS_PX = 6.0, 6.0, 3
 _STAR_SIGMAS = 3.0
+# A streak must stand out from its brightest point by this, lest noise beside a point pass for one.
+_STREAK_SIGMAS = 3.0
+# What a point smoothed by 1 px is again weighted with: the narrower, the nearer to a matched
+# filter of what it was before, until pixels and noise matter (measured: 1.1 of the bound).
+_WINDOW_VARIANCE = 0.5
 # Half side of the window of a centroid, and how far it may run, px.
 _WINDOW_PX, _FARTHEST_PX = 5, 2.0
+# Where the surroundings of a spot are looked at: outside a point, and at many sides of a streak.
+# Noise gives them less than this.
+_RING_PX, _RING_POINTS, _RING_SIGMAS = 7.0, 12, 1.0
 # An object whose light is new by this fraction is the spot; of others the spot is a part.
 _MOSTLY_NEW = 0.7
 # A star that clouds hid from most frames still shines in one; a slow RSO has left its place
@@ -90,9 +98,29 @@ def find_spots(
     fresh = np.flatnonzero(excess > _LOW_SIGMAS)
     spots = _measure(frame, pixels[fresh], excess[fresh], clean[fresh], star[fresh])
     inside = frame.contains(np.stack([spots["x"], spots["y"]], axis=1), BORDER_PX)
-    spots = spots[inside & (spots["excess"] > spot_sigmas)]
+    spots = spots[inside]
+    wide = _surroundings(frame, others, spots)
+    spots["excess"] -= wide
+    spots["snr"] -= np.where(spots["object_index"] < 0, wide, 0)
+    spots = spots[spots["excess"] > spot_sigmas]
     spots = spots[np.argsort(-spots["excess"], kind="stable")]
     return _one_per_object(spots)
+
+
+def _surroundings(frame: PastFrame, others: Sequence[PastFrame], spots: NDArray[np.void]) -> Array:
+    """Light around each spot that is no star's, in sigmas, (N,): a wisp of a cloud is wide."""
+    angle = np.arange(_RING_POINTS) * 2 * np.pi / _RING_POINTS
+    ring = _RING_PX * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    xy = np.stack([spots["x"], spots["y"]], axis=1)
+    limit = np.array(frame.shape[::-1]) - 1
+    pixels = np.clip(np.rint(xy[:, None] + ring), 0, limit).astype(np.intp).reshape(-1, 2)
+    if not len(pixels):
+        return np.zeros(0)
+    star = _excess(frame, others, pixels)[2]
+    light = frame.smoothed[pixels[:, 1], pixels[:, 0]] - star
+    light /= frame.noise_at(pixels)
+    around = np.median(light.reshape(len(spots), -1), axis=1)
+    return np.where(around > _RING_SIGMAS, around, 0)
 
 
 def spot_near(
@@ -196,7 +224,10 @@ def _refined_streak(
     merit = np.where(usable, (sums[last] - sums[first]) / np.sqrt(length), -np.inf)
     best = int(np.argmax(merit))
     # A point smoothed is about as long as this itself.
-    if length[best] <= _LONGEST_POINT_PX + 2 * _POINT_WIDTH_PX:
+    short = length <= _LONGEST_POINT_PX + 2 * _POINT_WIDTH_PX
+    unit = _line_noise(weight) * frame.noise
+    gain = (merit[best] ** 2 - np.max(merit[short]) ** 2) / unit**2
+    if short[best] or gain < _STREAK_SIGMAS**2:
         return None
     part = light.reshape(len(along), -1)[first[best] : last[best]].clip(0)
     sideways = float(part.sum(axis=0) @ across) / max(float(part.sum()), 1e-9)
@@ -213,6 +244,17 @@ def _refined_streak(
     return refined
 
 
+def _line_noise(weight: Array) -> float:
+    """Std of a profile's sum over the root of its length, for smoothed noise of std 1.
+
+    The profile is the sum across a line with these weights; noise smoothed by 1 px has the
+    correlation exp(-r^2/4), whose sum along a line is sqrt(4 pi).
+    """
+    offset = np.arange(len(weight))
+    correlation = np.exp(-((offset[:, None] - offset) ** 2) / 4)
+    return float(np.sqrt(weight @ correlation @ weight * np.sqrt(4 * np.pi)))
+
+
 def _refined_point(frame: PastFrame, others: Sequence[PastFrame], spot: np.void) -> np.void:
     start = np.array([spot["x"], spot["y"]])
     steps = np.arange(-_WINDOW_PX, _WINDOW_PX + 1)
@@ -226,12 +268,12 @@ def _refined_point(frame: PastFrame, others: Sequence[PastFrame], spot: np.void)
     place = start.copy()
     for _ in range(8):
         off = pixels - place
-        weight = light * np.exp(-np.sum(off**2, axis=1) / (2 * _POINT_WIDTH_PX**2))
+        weight = light * np.exp(-np.sum(off**2, axis=1) / (2 * _WINDOW_VARIANCE))
         total = weight.sum()
         if total <= 0:
             return spot
-        # The window halves the shift of what is as wide as itself.
-        step = 2 * (weight @ off) / total
+        # The narrower the window, the less of a shift it shows.
+        step = (1 + _POINT_WIDTH_PX**2 / _WINDOW_VARIANCE) * (weight @ off) / total
         place += step
         if np.hypot(*(place - start)) > _FARTHEST_PX:
             return spot

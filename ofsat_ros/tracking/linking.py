@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,8 @@ _GATE_SIGMAS = 3.0
 _LARGEST_GATE_PX = 6.0
 # Two spots of one RSO differ by less than this factor in brightness, also when it tumbles.
 _BRIGHTNESS_RATIO = 5.0
+# How far around a spot others are counted, px.
+_NEARBY_PX = 40.0
 # A spot that the frame before shows this near to its place on the sky is a star that changed, or
 # noise that a compressed video repeats, px.
 _REPEATED_PX = 0.35
@@ -80,7 +83,7 @@ class Sighting:
             telling &= ~np.isfinite(distance)
         return cls(frame, spots, sky, np.ones(len(spots), bool), telling)
 
-    @property
+    @cached_property
     def expected(self) -> Array:
         """How many telling spots of at least each spot's strength chance gives in a frame, (N,).
 
@@ -89,16 +92,30 @@ class Sighting:
         frame is white noise alone.
         """
         height, width = self.frame.shape
+        strongest = np.sort(self.spots["excess"][self.telling])
+        stronger = len(strongest) - np.searchsorted(strongest, self.spots["excess"], side="right")
+        return self._noise_peaks * height * width + stronger + 1
+
+    @cached_property
+    def log_density(self) -> Array:
+        """Logarithm of how many there are per px^2, (N,): in the frame, or nearby if more.
+
+        Clouds and artefacts give many spots in some places and none in others.
+        """
+        height, width = self.frame.shape
+        pairs = KDTree(self.sky).query_pairs(_NEARBY_PX, output_type="ndarray")
+        pairs = np.concatenate([pairs, pairs[:, ::-1]])
+        one, other = pairs.T
         excess = self.spots["excess"]
-        peaks = (2 * np.pi) ** -1.5 / 2 * excess * np.exp(-(excess**2) / 2)
-        strongest = np.sort(excess[self.telling])
-        stronger = len(strongest) - np.searchsorted(strongest, excess, side="right")
-        return peaks * height * width + stronger + 1
+        stronger = self.telling[other] & (excess[other] > excess[one])
+        nearby = np.bincount(one[stronger], minlength=len(self.spots))
+        density = self._noise_peaks + nearby / (np.pi * _NEARBY_PX**2)
+        return np.log(np.maximum(density, self.expected / (height * width)))
 
     @property
-    def log_density(self) -> Array:
-        """Logarithm of `expected` per px^2, (N,)."""
-        return np.log(self.expected / (self.frame.shape[0] * self.frame.shape[1]))
+    def _noise_peaks(self) -> Array:
+        excess = self.spots["excess"]
+        return (2 * np.pi) ** -1.5 / 2 * excess * np.exp(-(excess**2) / 2)
 
 
 @dataclass(frozen=True)
