@@ -1,8 +1,8 @@
 """The paper's results, reproduced: both engines over its two scenes, with its noise.
 
 ``python -m benchmarks.paper`` prints Markdown tables: the published presets, sparse beside dense,
-and the default, which looks back, with either engine.  ``--frames`` and ``--brightness`` shorten or vary it.  The
-figures in docs/algorithm.md are this program's output.
+and the default, which looks back, with either engine.  ``--frames`` and ``--brightness`` shorten
+or vary it.  The figures in docs/algorithm.md are this program's output.
 """
 
 from __future__ import annotations

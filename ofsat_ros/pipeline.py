@@ -332,7 +332,8 @@ class Pipeline:
         """Add the frame to the history, at its place on the sky."""
         if parameters.history_frames != self._history.length:
             old, self._history = self._history, History(parameters.history_frames)
-            leaving = max(0, len(old) - parameters.history_frames)
+            # This frame needs a place, too.
+            leaving = max(0, len(old) + 1 - parameters.history_frames)
             self._settled += self._tracker.settle(old, leaving)
             for frame in old:
                 self._history.add(frame)

@@ -13,7 +13,11 @@ import ofsat_ros
 PACKAGE = Path(ofsat_ros.__file__).parent
 FILES = {path.relative_to(PACKAGE).as_posix(): path for path in sorted(PACKAGE.rglob("*.py"))}
 ROS = {"ament_index_python", "builtin_interfaces", "launch", "launch_ros", "rcl_interfaces"}
-STAGES = {"preprocessing", "objects", "optical_flow", "star_field", "detection"}
+# In the order of the flow; history is what the last two share.
+STAGES = {
+    *("preprocessing", "objects", "optical_flow", "star_field"),
+    *("history", "detection", "tracking"),
+}
 # What each part may import of the others; a module or a package of modules is a part.
 ALLOWED = {
     "parameters": set(),
@@ -22,12 +26,15 @@ ALLOWED = {
     "objects": {"parameters"},
     "optical_flow": {"parameters"},
     "star_field": {"parameters", "optical_flow"},
-    "detection": {"parameters", "optical_flow", "star_field"},
+    "history": {"star_field"},
+    "detection": {"parameters", "optical_flow", "star_field", "history"},
+    "tracking": {"history", "detection"},
     "pipeline": {"parameters", *STAGES},
     "recordings": {"images"},
     "simulation": {"parameters"},
-    "results": {"parameters", "pipeline", "detection"},
-    "report": {"parameters", "pipeline"},
+    "results": {"parameters", "pipeline", "detection", "tracking"},
+    "evaluation": {"results"},
+    "report": {"pipeline", "detection", "tracking"},
 }
 # The two fronts use the rest, but not each other.
 ALLOWED["cli"] = ALLOWED["nodes"] = set(ALLOWED)

@@ -439,7 +439,8 @@ def test_what_process_writes_can_be_evaluated(tmp_path: Path):
     with ResultWriter(tmp_path) as writer:
         for k in range(5):
             detections = found if k == 1 else found[:0]
-            writer.add(FrameResult(stamp(k), k, (100, 100), detections=detections))
+            writer.add_star_field(FrameResult(stamp(k), k, (100, 100)))
+            writer.add_detections(stamp(k), k, detections)
     assert count_frames(tmp_path) == 5
     for path in (tmp_path, tmp_path / "detections.csv"):
         result = evaluate(truth({}), read_detections(path), frames=count_frames(tmp_path))

@@ -27,11 +27,15 @@ from ofsat_ros.parameters import (
 
 PRESETS = Path(ofsat_ros.__file__).parent / "presets"
 ALL = {f"{table.__name__}.{p.name}": p for table in TABLES for p in table.describe()}
-STAGES = {"preprocessing", "objects", "optical_flow", "star_field", "detection", "pipeline"}
+STAGES = {
+    *("preprocessing", "objects", "optical_flow", "star_field"),
+    *("detection", "tracking", "pipeline"),
+}
 UNITS = {"_px": "px", "_s": "s"}
 # Numbers that count or scale, and so have no unit.
 PURE = {
-    *("threshold_sigmas", "outlier_sigmas", "rso_sigmas", "max_objects", "max_corners"),
+    *("threshold_sigmas", "outlier_sigmas", "rso_sigmas", "spot_sigmas", "max_objects"),
+    *("max_corners", "false_tracks"),
     *("corner_quality", "pyramid_levels", "dense_pyramid_levels", "dense_iterations"),
     *("dense_noise_threshold", "marker_scale", "rate", "wait_for_subscribers", "seed", "frames"),
 }
@@ -125,6 +129,7 @@ def test_a_preset_is_the_default_but_for_its_file(name: str):
 
 def test_the_default_preset_is_the_tables_defaults():
     assert Parameters.preset() == Parameters.preset("robust") == Parameters()
+    assert Parameters().rso_test == "history"
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The pipeline: order of stages, the previous frame, and reasons in words."""
+"""The pipeline: order of stages, what is kept of the frames before, and reasons in words."""
 
 import functools
 import math
@@ -7,8 +7,10 @@ import re
 import numpy as np
 import pytest
 
+from ofsat_ros.detection import CONFIRMED
 from ofsat_ros.parameters import Parameters, preset_names
 from ofsat_ros.pipeline import FrameResult, ImageError, Pipeline
+from ofsat_ros.tracking import COASTING, Settled
 
 STEP_NS = 500_000_000
 START_NS = 1_767_225_600_123_456_789
@@ -65,6 +67,25 @@ def run(scene: Scene, count: int = 4, **changes) -> list[FrameResult]:
     return [pipeline.process(as16(scene.image(i)), stamp(i)) for i in range(count)]
 
 
+def two_frames(**changes) -> Pipeline:
+    """Return a pipeline that compares two frames and says at once what it found."""
+    return Pipeline(Parameters(rso_test="vector", **changes))
+
+
+def rows_of(truth: np.ndarray, detections: np.ndarray) -> np.ndarray:
+    """Return the detections in the order of the truth, which they all are, and no others."""
+    order = [
+        np.argmin(np.hypot(detections["x"] - x, detections["y"] - y)) if len(detections) else -1
+        for x, y in truth
+    ]
+    assert sorted(order) == list(range(len(truth))) == list(range(len(detections)))
+    return detections[order]
+
+
+def columns(table: np.ndarray, first: str, second: str) -> np.ndarray:
+    return np.stack([table[first], table[second]], axis=1)
+
+
 def assert_same(one: FrameResult, other: FrameResult) -> None:
     """All but the times that the stages took."""
     for name in ("stamp_ns", "frame", "shape", "dt_s", "reset", "reason", "noise", "threshold"):
@@ -79,33 +100,71 @@ def assert_same(one: FrameResult, other: FrameResult) -> None:
 # What is found
 
 
-@pytest.mark.parametrize("scene", [SIDEREAL, RATE, SURVEY], ids=["sidereal", "rate", "survey"])
-@pytest.mark.parametrize("engine", ["sparse", "dense"])
-def test_the_default_finds_the_rsos_and_nothing_else(scene: Scene, engine: str):
-    for frame, result in enumerate(run(scene, engine=engine)):
+SCENES = pytest.mark.parametrize(
+    "scene", [SIDEREAL, RATE, SURVEY], ids=["sidereal", "rate", "survey"]
+)
+ENGINES = pytest.mark.parametrize("engine", ["sparse", "dense"])
+
+
+@SCENES
+@ENGINES
+def test_two_frames_show_the_rsos_and_nothing_else(scene: Scene, engine: str):
+    for frame, result in enumerate(run(scene, engine=engine, rso_test="vector")):
         # and some of noise: of 256^2 / 13 independent places a few hundredths of a per cent
         assert 49 + 3 <= len(result.objects) <= 49 + 3 + 3
         if frame == 0:
             assert len(result.detections) == 0
             continue
         truth = scene.rsos_at(frame)
-        order = [
-            np.argmin(np.hypot(result.detections["x"] - x, result.detections["y"] - y))
-            for x, y in truth
-        ]
-        assert sorted(order) == [0, 1, 2] == list(range(len(result.detections)))
-        found = result.detections[order]
+        found = rows_of(truth, result.detections)
         # 1.8 px / SNR of about 70, and five times that at most
-        assert np.abs(found["x"] - truth[:, 0]).max() < 0.13
-        assert np.abs(found["y"] - truth[:, 1]).max() < 0.13
-        velocity = np.stack([found["vx"], found["vy"]], axis=1)
-        relative = np.stack([found["rel_vx"], found["rel_vy"]], axis=1)
+        np.testing.assert_allclose(columns(found, "x", "y"), truth, atol=0.13)
         # Lucas-Kanade is good to 0.1 px a frame here: 0.2 px/s.
+        velocity = columns(found, "vx", "vy")
         np.testing.assert_allclose(velocity, scene.rso_steps / 0.5, atol=0.3)
         expected = (scene.rso_steps - scene.star_step) / 0.5
-        np.testing.assert_allclose(relative, expected, atol=0.3)
+        np.testing.assert_allclose(columns(found, "rel_vx", "rel_vy"), expected, atol=0.3)
         np.testing.assert_allclose(result.star_field.displacement, scene.star_step, atol=0.05)
         assert result.star_field.star_count >= 45
+        assert result.reason == ""
+        assert not found["status"].any()
+        assert not found["track_id"].any()
+        assert len(result.tracks) == 0
+
+
+@SCENES
+@ENGINES
+def test_the_default_confirms_the_rsos_in_their_third_frame_and_nothing_else(
+    scene: Scene, engine: str
+):
+    ids = None
+    for frame, result in enumerate(run(scene, 7, engine=engine)):
+        assert result.star_rows.size == (result.star_field.star_count if frame else 0)
+        if frame < 2:
+            assert (len(result.detections), len(result.tracks)) == (0, 0)
+            continue
+        truth = scene.rsos_at(frame)
+        found = rows_of(truth, result.detections)
+        assert (found["status"] == CONFIRMED).all()
+        ids = found["track_id"].tolist() if ids is None else ids
+        assert found["track_id"].tolist() == ids
+        assert sorted(ids) == [1, 2, 3]
+        # As for two frames: the centroids are the same.
+        np.testing.assert_allclose(columns(found, "x", "y"), truth, atol=0.13)
+        # A line through k places, each off by 0.03 px, and up to 0.1 px near a star: of three,
+        # 0.1 sqrt(2) / 2 px a frame, of seven 0.1 / sqrt(28).
+        atol = {2: 0.2, 3: 0.12}.get(frame, 0.08)
+        velocity = columns(found, "vx", "vy")
+        np.testing.assert_allclose(velocity, scene.rso_steps / 0.5, atol=atol)
+        expected = (scene.rso_steps - scene.star_step) / 0.5
+        np.testing.assert_allclose(columns(found, "rel_vx", "rel_vy"), expected, atol=atol)
+        tracks = rows_of(truth, result.tracks)
+        assert tracks["track_id"].tolist() == ids
+        assert tracks["hits"].tolist() == [frame + 1] * 3
+        assert not tracks["misses"].any()
+        np.testing.assert_allclose(columns(tracks, "x", "y"), truth, atol=0.13)
+        np.testing.assert_allclose(columns(tracks, "vx", "vy"), velocity)
+        assert result.spot_count >= 3
         assert result.reason == ""
 
 
@@ -134,7 +193,7 @@ def test_the_published_sparse_preset_finds_rsos_among_fixed_stars():
 
 def test_without_a_background_mesh_the_rsos_are_still_found():
     for frame, result in enumerate(run(SURVEY, background="none")):
-        assert len(result.detections) == (3 if frame else 0), result.reason
+        assert len(result.detections) == (3 if frame >= 2 else 0), result.reason
         # 30,000 DN, of which the wings are lost: not the 3,000 DN of the sky of each pixel.
         assert result.detections["flux"] == pytest.approx(30_000, rel=0.05)
 
@@ -150,14 +209,14 @@ def test_flux_is_without_the_sky_in_every_preset(preset: str):
 def test_eight_and_sixteen_bit_agree():
     """The same sky, at 1 / 64 of the grey levels: noise of 0.6 DN and rounding to 1 DN."""
     fine, coarse = Pipeline(), Pipeline()
-    for frame in range(3):
+    for frame in range(4):
         image = SURVEY.image(frame)
         a = fine.process(as16(image), stamp(frame))
         b = coarse.process(np.rint(image / 64).clip(0, 255).astype(np.uint8), stamp(frame))
         assert b.background * 64 == pytest.approx(a.background, abs=20)
         # Rounding adds (0.29 / 0.63)^2 / 2 = 11 %.
         assert b.noise * 64 == pytest.approx(1.11 * a.noise, rel=0.05)
-        assert len(a.detections) == len(b.detections) == (3 if frame else 0)
+        assert len(a.detections) == len(b.detections) == (3 if frame >= 2 else 0)
         for name, tolerance in (("x", 0.1), ("y", 0.1), ("rel_vx", 0.3), ("rel_vy", 0.3)):
             one, other = (np.sort(r.detections[name]) for r in (a, b))
             np.testing.assert_allclose(one, other, atol=tolerance, err_msg=name)
@@ -169,7 +228,7 @@ def test_float_and_sixteen_bit_agree():
         image = as16(SURVEY.image(frame))
         a = whole.process(image, stamp(frame))
         b = fine.process(image.astype(np.float32), stamp(frame))
-        assert len(a.detections) == len(b.detections) == (3 if frame else 0)
+        assert len(a.detections) == len(b.detections) == (3 if frame >= 2 else 0)
         for name in ("x", "y", "rel_vx", "rel_vy"):
             one, other = (np.sort(r.detections[name]) for r in (a, b))
             np.testing.assert_allclose(one, other, atol=0.02, err_msg=name)
@@ -185,7 +244,7 @@ def test_frames_are_counted_and_timed():
     assert math.isnan(results[0].dt_s)
     assert [r.dt_s for r in results[1:]] == [0.5] * 3
     assert {r.shape for r in results} == {(SIZE, SIZE)}
-    stages = ["preprocessing", "objects", "star_field", "optical_flow", "detection"]
+    stages = ["preprocessing", "objects", "star_field", "optical_flow", "detection", "tracking"]
     assert list(results[0].seconds) == stages[:2]
     assert list(results[1].seconds) == stages
     assert all(0 < s < 10 for s in results[1].seconds.values())
@@ -200,7 +259,7 @@ def test_levels_are_those_of_the_image():
 
 
 def test_velocities_follow_the_stamps_and_not_the_count():
-    pipeline = Pipeline()
+    pipeline = two_frames()
     times = [0, STEP_NS, 5 * STEP_NS]  # frames 1, 2 and 3 are missing
     results = [
         pipeline.process(as16(SIDEREAL.image(i)), START_NS + t) for i, t in enumerate(times)
@@ -213,7 +272,7 @@ def test_velocities_follow_the_stamps_and_not_the_count():
 
 
 def test_rows_refer_to_each_other():
-    result = run(SURVEY, 2)[1]
+    result = run(SURVEY, 2, rso_test="vector")[1]
     flow, found = result.flow, result.detections
     for row in found:
         thing = result.objects[row["object_index"]]
@@ -224,6 +283,16 @@ def test_rows_refer_to_each_other():
     assert len(result.star_field.inliers) == len(flow)
     assert not result.star_field.inliers[found["flow_index"]].any()
     assert np.isnan(found["ra"]).all()
+
+
+def test_rows_of_tracks_refer_to_objects():
+    result = run(SURVEY, 4)[-1]
+    for row in result.detections:
+        thing = result.objects[row["object_index"]]
+        assert np.hypot(row["x"] - thing["x"], row["y"] - thing["y"]) < 0.2
+        assert (row["snr"], row["flux"]) == (thing["snr"], thing["flux"])
+        assert row["flow_index"] == -1
+    assert np.isnan(result.detections["ra"]).all()
 
 
 def test_the_same_frames_give_the_same_results():
@@ -319,13 +388,12 @@ def test_the_smallest_and_dullest_images_go_through(preset: str, dtype):
 def test_missing_pixels_do_not_hide_the_rsos():
     pipeline = Pipeline()
     random = np.random.default_rng(9)
-    for frame in range(2):
+    for frame in range(3):
         image = SURVEY.image(frame).astype(np.float32)
         image[random.integers(0, SIZE, 300), random.integers(0, SIZE, 300)] = np.nan
         image[:10] = np.inf
         result = pipeline.process(image, stamp(frame))
-    truth = SURVEY.rsos_at(1)
-    for x, y in truth:
+    for x, y in SURVEY.rsos_at(2):
         distance = np.hypot(result.detections["x"] - x, result.detections["y"] - y)
         assert distance.min() < 1
 
@@ -361,7 +429,7 @@ RESETS = {
 @pytest.mark.parametrize("cause", RESETS)
 def test_a_reset_names_its_cause_and_the_frame_after_works(cause: str):
     make, at_ns, reason = RESETS[cause]
-    pipeline = Pipeline(Parameters(max_gap_s=60))
+    pipeline = two_frames(max_gap_s=60)
     pipeline.process(as16(SURVEY.image(0)), stamp(0))
     image = make()
     result = pipeline.process(image, at_ns)
@@ -407,7 +475,7 @@ def test_a_reset_before_the_first_frame_gives_its_own_reason():
 
 
 def test_parameters_change_from_frame_to_frame():
-    pipeline = Pipeline()
+    pipeline = two_frames()
     for frame, changes in enumerate(
         (
             {},
@@ -416,7 +484,7 @@ def test_parameters_change_from_frame_to_frame():
             {"min_relative_px": 10.0},
         )
     ):
-        pipeline.parameters = Parameters(**changes)
+        pipeline.parameters = Parameters(rso_test="vector", **changes)
         result = pipeline.process(as16(SURVEY.image(frame)), stamp(frame))
         assert bool(result.reset) == (frame == 0)
         assert len(result.detections) == {0: 0, 3: 0}.get(frame, 3)
@@ -424,9 +492,9 @@ def test_parameters_change_from_frame_to_frame():
 
 
 def test_frames_that_were_preprocessed_differently_are_not_compared():
-    pipeline = Pipeline()
+    pipeline = two_frames()
     pipeline.process(as16(SURVEY.image(0)), stamp(0))
-    pipeline.parameters = Parameters(smoothing_sigma_px=2.0, background="none")
+    pipeline.parameters = pipeline.parameters.replace(smoothing_sigma_px=2.0, background="none")
     result = pipeline.process(as16(SURVEY.image(1)), stamp(1))
     assert result.reset == "background and smoothing_sigma_px changed"
     after = pipeline.process(as16(SURVEY.image(2)), stamp(2))
@@ -473,12 +541,20 @@ def test_why_nothing_when_all_is_new():
 
 
 def test_why_nothing_when_all_moves_alike():
-    pipeline = Pipeline()
-    scene = Scene((1.0, -2.0), [])
-    for frame in range(3):
-        result = pipeline.process(as16(scene.image(frame)), stamp(frame))
+    result = run(Scene((1.0, -2.0), []), 3, spot_sigmas=10.0)[-1]
     assert result.reason == "everything moves with the star field (49 stars)"
     assert result.star_field.star_count == 49
+    assert result.spot_count == 0
+
+
+def test_why_nothing_when_only_noise_moves():
+    """256^2 px have some 15 peaks over 3 sigma (see `Sighting.expected`), none on a path."""
+    result = run(Scene((1.0, -2.0), []), 4)[-1]
+    assert 5 < result.spot_count < 40
+    assert result.reason == (
+        f"49 stars; none of {result.spot_count} spots beside them lies on a path that noise would"
+        " not explain"
+    )
 
 
 def test_why_nothing_with_one_object():
@@ -503,7 +579,7 @@ def test_why_nothing_when_no_two_agree():
 
 def test_objects_that_come_back_are_found_again():
     """A cloud hides all; the frame after it starts from nothing, the next one finds."""
-    pipeline = Pipeline()
+    pipeline = two_frames()
     for frame in range(5):
         image = SURVEY.image(frame)
         if frame == 2:
@@ -511,3 +587,186 @@ def test_objects_that_come_back_are_found_again():
         result = pipeline.process(as16(image), stamp(frame))
         assert len(result.detections) == (3 if frame in (1, 4) else 0), frame
     assert result.reset == ""
+
+
+# The last word
+
+
+def settle(pipeline: Pipeline, images: list[np.ndarray], stamps: list[int]) -> list[Settled]:
+    """Process all; each frame settled is of its number and stamp, and no later than it may be."""
+    settled: list[Settled] = []
+    for number, (image, stamp_ns) in enumerate(zip(images, stamps, strict=True)):
+        result = pipeline.process(image, stamp_ns)
+        settled += result.settled
+        assert len(settled) <= number + 1
+        if pipeline.parameters.rso_test == "history":
+            # Those that are not settled yet are still in the history.
+            assert number + 1 - len(settled) < pipeline.parameters.history_frames
+    settled += pipeline.finish()
+    assert pipeline.finish() == []
+    assert [one.frame for one in settled] == list(range(len(images)))
+    assert [one.stamp_ns for one in settled] == stamps
+    return settled
+
+
+def test_what_is_settled_was_there_before_it_was_confirmed():
+    frames = range(7)
+    settled = settle(
+        Pipeline(), [as16(SURVEY.image(i)) for i in frames], [stamp(i) for i in frames]
+    )
+    ids = rows_of(SURVEY.rsos_at(6), settled[6].detections)["track_id"].tolist()
+    assert sorted(ids) == [1, 2, 3]
+    for one in settled:
+        truth = SURVEY.rsos_at(one.frame)
+        found = rows_of(truth, one.detections)
+        assert found["track_id"].tolist() == ids
+        assert (found["status"] == CONFIRMED).all()
+        np.testing.assert_allclose(columns(found, "x", "y"), truth, atol=0.13)
+        # A line through seven places: see the default's test.
+        velocity = columns(found, "vx", "vy")
+        np.testing.assert_allclose(velocity, SURVEY.rso_steps / 0.5, atol=0.05)
+
+
+def test_a_frame_is_settled_when_it_leaves_the_history():
+    results = run(SURVEY, 9, history_frames=4)
+    numbers = [[one.frame for one in result.settled] for result in results]
+    assert numbers == [[], [], [], [0], [1], [2], [3], [4], [5]]
+
+
+def test_finish_before_anything_and_a_new_start_after_it():
+    pipeline = Pipeline()
+    assert pipeline.finish() == []
+    for start in (0, 3):
+        for frame in range(3):
+            result = pipeline.process(as16(SURVEY.image(frame)), stamp(start + frame))
+            assert result.reset == ("finished" if frame == 0 else "")
+        assert (result.detections["status"] == CONFIRMED).all()
+        # No id is used twice.
+        assert sorted(result.detections["track_id"]) == [start + 1, start + 2, start + 3]
+        assert [one.frame for one in pipeline.finish()] == [start, start + 1, start + 2]
+
+
+INTERRUPTIONS = {
+    "gap": lambda image, at: (image, at + 10**12),
+    "backwards": lambda image, at: (image, at - 10**12),
+    "same stamp": lambda image, at: (image, at - STEP_NS),
+    "size": lambda image, at: (image[:240], at),
+    "type": lambda image, at: (image.astype(np.float32), at),
+}
+
+
+@pytest.mark.parametrize("cause", INTERRUPTIONS)
+@pytest.mark.parametrize("length", [1, 4, 10])
+def test_each_frame_is_settled_once_in_order_across_a_reset(cause: str, length: int):
+    """`length` frames on either side of it: less and more than the history holds."""
+    images, stamps = [], []
+    for frame in range(2 * length):
+        image, at = as16(SURVEY.image(frame)), stamp(frame)
+        if frame >= length:
+            image, at = INTERRUPTIONS[cause](image, at)
+        images.append(image)
+        stamps.append(at)
+    settled = settle(Pipeline(), images, stamps)
+    ids: list[set[int]] = [set(), set()]
+    for one in settled:
+        assert len(one.detections) == (3 if length > 2 else 0), one.frame
+        ids[one.frame >= length] |= set(one.detections["track_id"].tolist())
+    # A track does not outlive a reset, nor is its id used again.
+    assert ids == ([{1, 2, 3}, {4, 5, 6}] if length > 2 else [set(), set()])
+
+
+def test_a_reset_that_was_asked_for_loses_no_frame():
+    pipeline, numbers = Pipeline(), []
+    for frame in range(8):
+        if frame in (3, 4):
+            pipeline.reset()
+        result = pipeline.process(as16(SURVEY.image(frame)), stamp(frame))
+        # What was in the history goes with the next frame.
+        numbers.append([one.frame for one in result.settled])
+    assert numbers == [[], [], [], [0, 1, 2], [3], [], [], []]
+    assert [one.frame for one in pipeline.finish()] == [4, 5, 6, 7]
+
+
+@pytest.mark.parametrize("preset", ["paper_opencv", "paper_matlab"])
+def test_two_frames_settle_at_once_what_they_detect(preset: str):
+    pipeline = Pipeline(Parameters.preset(preset))
+    seen = 0
+    for frame in range(4):
+        result = pipeline.process(as16(SURVEY.image(frame)), stamp(frame))
+        (one,) = result.settled
+        assert (one.frame, one.stamp_ns) == (frame, stamp(frame))
+        assert one.detections.tobytes() == result.detections.tobytes()
+        seen += len(one.detections)
+    assert pipeline.finish() == []
+    assert seen > 0
+
+
+def test_the_test_may_change_while_running():
+    """From a history to two frames and back: each frame is settled once, in order."""
+    pipeline, settled = Pipeline(), []
+    for frame in range(15):
+        test = "vector" if 5 <= frame < 10 else "history"
+        pipeline.parameters = Parameters(rso_test=test)
+        settled += pipeline.process(as16(SURVEY.image(frame)), stamp(frame)).settled
+    settled += pipeline.finish()
+    assert [one.frame for one in settled] == list(range(15))
+
+
+# The history
+
+
+def clouded(scene: Scene, frame: int, hidden: range) -> np.ndarray:
+    if frame in hidden:
+        return as16(np.random.default_rng(frame).normal(3000, 40, (SIZE, SIZE)))
+    return as16(scene.image(frame))
+
+
+@pytest.mark.parametrize("hidden", [range(4, 5), range(4, 6)], ids=len)
+def test_the_fields_motion_is_taken_to_go_on_for_three_frames(hidden: range):
+    """A cloud hides all; the tracks coast under it and have their ids after it."""
+    pipeline, ids = Pipeline(), None
+    for frame in range(10):
+        result = pipeline.process(clouded(SURVEY, frame, hidden), stamp(frame))
+        if frame < 2:
+            continue
+        # The first frame after the cloud shows no motion of the field either.
+        if frame in hidden or frame - 1 in hidden:
+            assert result.star_field is None
+        tracks = rows_of(SURVEY.rsos_at(frame), result.tracks)
+        ids = tracks["track_id"].tolist() if ids is None else ids
+        assert tracks["track_id"].tolist() == ids
+        assert (tracks["status"] == (COASTING if frame in hidden else CONFIRMED)).all(), frame
+        assert len(result.detections) == (0 if frame in hidden else 3)
+    assert sorted(ids) == [1, 2, 3]
+    assert tracks["misses"].tolist() == [len(hidden)] * 3
+
+
+def test_when_the_field_is_lost_for_longer_all_starts_afresh():
+    pipeline, settled, hidden = Pipeline(), [], range(4, 9)
+    for frame in range(13):
+        result = pipeline.process(clouded(SURVEY, frame, hidden), stamp(frame))
+        settled += result.settled
+        if frame in (4, 5, 6):
+            assert result.tracks["status"].tolist() == [COASTING] * 3
+        if frame in (7, 8, 9):
+            assert len(result.tracks) == 0
+    assert sorted(result.detections["track_id"]) == [4, 5, 6]
+    settled += pipeline.finish()
+    assert [one.frame for one in settled] == list(range(13))
+    for one in settled:
+        assert len(one.detections) == (0 if one.frame in hidden else 3), one.frame
+
+
+@pytest.mark.parametrize(("before", "after"), [(9, 4), (4, 9), (4, 3), (3, 4), (9, 3)])
+def test_the_history_may_change_its_length_while_running(before: int, after: int):
+    pipeline, settled = Pipeline(Parameters(history_frames=before)), []
+    for frame in range(16):
+        if frame == 10:
+            pipeline.parameters = Parameters(history_frames=after)
+        result = pipeline.process(as16(SURVEY.image(frame)), stamp(frame))
+        assert result.reset == ("first frame" if frame == 0 else "")
+        settled += result.settled
+        if frame >= 3:
+            assert {1, 2, 3} <= set(result.tracks["track_id"].tolist())
+    settled += pipeline.finish()
+    assert [one.frame for one in settled] == list(range(16))

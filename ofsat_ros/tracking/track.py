@@ -21,7 +21,7 @@ _STREAK_SPREAD, _REFINED_SPREAD = 0.12, 0.01
 _FIT_HITS, _WAY_HITS = 9, 5
 # What stays within this way on the sky is a star, px; nor is it motion if it may be chance.
 _LEAST_WAY_PX, _WAY_SIGMAS = 1.0, 4.0
-# Logarithm of how much less likely a miss makes a track.
+# Logarithm of how much less likely a miss makes a track, and a hit after its birth more.
 _MISS_LOG = 1.5
 # Nothing is known of the velocity before the second hit, px per frame.
 _ANY_SPEED_PX = 1000.0
@@ -80,8 +80,8 @@ class Track:
         Number of the frame to hit, for the frames that the history still holds.
     track_id : int
         Its number, never used again; 0 until it is confirmed.
-    hit_count : int
-        All hits.
+    hit_count, born_hits : int
+        All hits, and those that it was born with.
     born_ns : int
         Stamp of the first hit.
     misses : int
@@ -101,6 +101,7 @@ class Track:
     hits: dict[int, Hit]
     track_id: int = 0
     hit_count: int = 0
+    born_hits: int = 0
     born_ns: int = 0
     misses: int = 0
     missed: int = 0
@@ -113,7 +114,8 @@ class Track:
         hits = [self.hits[number] for number in sorted(self.hits)]
         first = hits[0]
         rate = (_ANY_SPEED_PX / self.frame_s) ** 2
-        self.hit_count, self.born_ns = len(hits), first.stamp_ns
+        self.hit_count = self.born_hits = len(hits)
+        self.born_ns = first.stamp_ns
         self.state = np.array([*first.sky, 0.0, 0.0])
         self.covariance = np.diag([0.0, 0.0, rate, rate])
         self.covariance[:2, :2] = first.covariance
@@ -165,8 +167,10 @@ class Track:
         return way < max(_LEAST_WAY_PX, _WAY_SIGMAS * error * span)
 
     def is_sustained(self, log_limit: float) -> bool:
-        """Whether it is still no chance when the frames in which it was missed are counted."""
-        return self.log_false + _MISS_LOG * max(self.missed, self.misses) < log_limit
+        """Whether it is still no chance when hits and misses since its birth are counted."""
+        later = self.hit_count - self.born_hits
+        balance = max(self.missed, self.misses) - later
+        return self.log_false + _MISS_LOG * balance < log_limit
 
     def _line(self, hits: list[Hit]) -> tuple[Array, float]:
         """Velocity of the line through hits, px/s, and its std."""

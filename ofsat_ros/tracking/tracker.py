@@ -209,6 +209,8 @@ class Tracker:
         cost = np.full((len(self._tracks), len(pool)), _NEVER)
         for row, track in enumerate(self._tracks):
             cost[row] = _distances(track, frame, pool, len(sighting.spots))
+        # What is beyond the gate must not weigh in what others get.
+        cost[cost >= _GATE_SIGMAS**2] = _NEVER
         return {
             int(row): Hit.of(frame, pool[column])
             for row, column in zip(*linear_sum_assignment(cost), strict=True)
