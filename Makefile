@@ -25,7 +25,7 @@ help:
 	$(say) 'make demo   replay a sample bag to the detector over DDS; results in demo_output/'
 	$(say) 'make test   run all tests'
 	$(say) 'make lint   check format, style and types'
-	$(say) "make bench  reproduce the paper's results as a table"
+	$(say) "make bench  the paper's scenes, and detection beside its peers, as tables"
 	$(say) 'make clean  remove everything that make and colcon made'
 
 .PHONY: demo
@@ -51,6 +51,8 @@ lint: $(STAMP)
 bench: $(STAMP)
 	$(say) "bench: the paper's scenes, both engines"
 	@$(BIN)/python -m benchmarks.paper
+	$(say) 'bench: detection beside the published method and SExtractor'
+	@$(BIN)/python -m benchmarks.detection
 
 .PHONY: clean
 clean:

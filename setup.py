@@ -24,12 +24,13 @@ ROS = [
     *OPENCV,
 ]
 LINT = ["mypy>=2.4,<3", "ruff>=0.17,<0.18", "types-PyYAML", "types-tqdm"]
-BENCH = ["matplotlib", "sep"]
+BENCH = ["matplotlib"]
 TEST = [
     "colcon-core",
     "colcon-ros",
     "hypothesis",
     "pytest>=9",
+    "sep",
     "setuptools>=70.1,<80",  # the range in which colcon and pip can both build with it
 ]
 

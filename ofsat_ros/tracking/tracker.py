@@ -44,6 +44,8 @@ _LONGEST_POINT_PX = 4.0
 _SURE_PX = 1.5
 # A spot fainter than this has a poor place of its own, sigmas.
 _FAINT_SIGMAS = 4.0
+# What is left of a star beside a spot may pull it by this, px.
+_PULLED_PX = 1.0
 # The distance of what cannot be.
 _NEVER = 1e6
 # A frame in which the track itself was as near as this doesn't show what is behind it, px.
@@ -238,8 +240,9 @@ class Tracker:
         if any(np.hypot(*(xy - other)) < _PIECE_PX for other in taken):
             return None
         hit = Hit.of(frame, spot)
-        if hit.spot["excess"] < _FAINT_SIGMAS:
-            gain = covariance[:2, :2] @ np.linalg.inv(covariance[:2, :2] + hit.covariance)
+        if hit.spot["excess"] < _FAINT_SIGMAS or not spot["clean"]:
+            own = hit.covariance + (0 if spot["clean"] else _PULLED_PX**2) * np.eye(2)
+            gain = covariance[:2, :2] @ np.linalg.inv(covariance[:2, :2] + own)
             sky = state[:2] + gain @ (hit.sky - state[:2])
             spot["x"], spot["y"] = frame.pixels(sky[None])[0]
         taken.append(xy)
