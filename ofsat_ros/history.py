@@ -201,4 +201,7 @@ def _backwards(motion: StarFieldMotion) -> Array:
 
 
 def _transform(matrix: Array, xy: Array) -> Array:
-    return xy @ matrix[:2, :2].T + matrix[:2, 2]
+    # Written out: a matrix product of two columns takes many times as long.
+    x, y = xy[..., 0], xy[..., 1]
+    rows = [row[0] * x + row[1] * y + row[2] for row in matrix[:2]]
+    return np.stack(rows, axis=-1)

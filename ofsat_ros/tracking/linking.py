@@ -9,10 +9,12 @@ spots abound, more is asked of a path.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
@@ -32,6 +34,8 @@ _SPREAD_PX = 0.35
 _STREAK_SPREAD = 0.12
 _GATE_SIGMAS = 3.0
 _LARGEST_GATE_PX = 6.0
+# Side of a cell of the map that says where spots are, px.
+_CELL_PX = 4
 # Two spots of one RSO differ by less than this factor in brightness, also when it tumbles.
 _BRIGHTNESS_RATIO = 5.0
 # How far around a spot others are counted, px.
@@ -111,6 +115,26 @@ class Sighting:
         nearby = np.bincount(one[stronger], minlength=len(self.spots))
         density = self._noise_peaks + nearby / (np.pi * _NEARBY_PX**2)
         return np.log(np.maximum(density, self.expected / (height * width)))
+
+    @cached_property
+    def _vicinity(self) -> NDArray[np.uint8]:
+        """Coarse map of the places that are within the usual gate of a free spot, nonzero."""
+        height, width = self.frame.shape
+        cells = np.zeros((height // _CELL_PX + 1, width // _CELL_PX + 1), np.uint8)
+        x, y = (self.spots[name][self.free] for name in ("x", "y"))
+        cells[(y / _CELL_PX).astype(int), (x / _CELL_PX).astype(int)] = 1
+        reach = 2 * (math.ceil(_LARGEST_GATE_PX / _CELL_PX) + 1) + 1
+        return cv2.dilate(cells, np.ones((reach, reach), np.uint8))
+
+    def may_be_near(self, xy: Array, reach: Array) -> NDArray[np.bool_]:
+        """Whether a free spot may lie within reach of points (N, 2) px inside the image, (N,).
+
+        Most points of most paths are far from all spots, and this costs less than a search.
+        """
+        column, row = np.clip(xy / _CELL_PX, 0, None).astype(int).T
+        rows, columns = self._vicinity.shape
+        near = self._vicinity[np.minimum(row, rows - 1), np.minimum(column, columns - 1)] > 0
+        return near | (reach > _LARGEST_GATE_PX)
 
     @property
     def _noise_peaks(self) -> Array:
@@ -250,6 +274,10 @@ class _Paths:
             1 + 1 / self._count[seen] + since[seen] ** 2 / self._time_spread()[seen]
         )
         gate = np.minimum(_GATE_SIGMAS * error, _LARGEST_GATE_PX + 0.3 * self._length[seen])
+        close = other.may_be_near(places[seen], gate)
+        seen, error, gate = seen[close], error[close], gate[close]
+        if not seen.size:
+            return
         xy = np.stack([other.spots["x"], other.spots["y"]], axis=1)[free]
         distance, nearest = KDTree(xy).query(places[seen], distance_upper_bound=float(gate.max()))
         near = distance < gate
