@@ -164,6 +164,7 @@ class Pipeline:
     def finish(self) -> list[Settled]:
         """Say the last word on the frames that it was not said of yet, and start afresh."""
         self.reset("finished")
+        self._sensor = SensorMemory()
         settled, self._settled = self._settled, []
         return settled
 

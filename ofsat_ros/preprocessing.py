@@ -87,20 +87,25 @@ class SensorMemory:
 
     def __init__(self) -> None:
         self._mean: Image | None = None
+        self._dtype: np.dtype | None = None
         self._count = 0
 
-    def defects(self, image: Image, noise: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def defects(
+        self, image: Image, noise: float, dtype: np.dtype
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Add an image and return the rows and columns of the defects that the mean shows.
 
         Parameters
         ----------
         image : (H, W) float32
-            Image less its background, DN.  One of another size than before starts afresh.
+            Image less its background, DN.
         noise : float
             Std of its background, DN.
+        dtype : dtype
+            Type of the camera's image.  Another size or type than before starts afresh.
         """
-        if self._mean is None or self._mean.shape != image.shape:
-            self._mean, self._count = np.zeros_like(image), 0
+        if self._mean is None or self._mean.shape != image.shape or self._dtype != dtype:
+            self._mean, self._count, self._dtype = np.zeros_like(image), 0, dtype
         self._count = min(self._count + 1, _MEMORY_FRAMES)
         cv2.accumulateWeighted(image, self._mean, 1 / self._count)
         stars = _kept(image, *_peaks(image, _KEPT_SIGMAS * noise))
@@ -156,7 +161,7 @@ def preprocess(
     pixel_noise = float(np.median(_mesh_statistics(image, coarse, rounding)[1]))
     defects = 0
     if parameters.hot_pixels == "replace":
-        known = memory.defects(image, pixel_noise) if memory else (_NONE, _NONE)
+        known = memory.defects(image, pixel_noise, raw.dtype) if memory else (_NONE, _NONE)
         defects = len(known[0])
         for y, x in (_sharp_pixels(image, pixel_noise), known):
             around = [image[_beside(image.shape, y, x, step)] for step in _AROUND]
@@ -195,7 +200,7 @@ def preprocess(
 
 def _finite(raw: NDArray[np.generic]) -> Image:
     """A float32 copy in which every value is finite, and its square too."""
-    image = raw.astype(np.float32)
+    image = raw.astype(np.float32, order="C")
     if raw.dtype.kind == "f":
         usable = np.abs(image) < _LARGEST
         if not usable.any():

@@ -22,6 +22,8 @@ _VOTE_CELLS = 512
 _MODE_VECTORS = 400
 # A similarity has four parameters; with fewer stars than this their scatter goes into them.
 _STARS_FOR_SIMILARITY = 6
+# Of so many vectors, this part at least must share a motion that is the field's.
+_MANY_VECTORS, _LEAST_SHARE = 20, 0.1
 # Cut of Tukey's biweight, in sigmas: 95 % efficiency on Gaussian errors.
 _TUKEY = 4.685
 
@@ -117,7 +119,8 @@ def estimate_motion(
     Returns
     -------
     StarFieldMotion or None
-        None if there is no vector, or no two that agree where there are several.
+        None if there is no vector, no two that agree where there are several, or fewer than a
+        tenth of many.
     """
     if not len(position):
         return None
@@ -127,7 +130,9 @@ def estimate_motion(
     inliers = _mode(displacement, sigma)
     if len(position) > 1 and np.count_nonzero(inliers) < 2:
         return None
-    return _robust_fit(position - centre, displacement, sigma, speed, centre, inliers, model)
+    motion = _robust_fit(position - centre, displacement, sigma, speed, centre, inliers, model)
+    few = len(position) >= _MANY_VECTORS and motion.star_count < _LEAST_SHARE * len(position)
+    return None if few else motion
 
 
 def vote_shift(

@@ -770,3 +770,40 @@ def test_the_history_may_change_its_length_while_running(before: int, after: int
             assert {1, 2, 3} <= set(result.tracks["track_id"].tolist())
     settled += pipeline.finish()
     assert [one.frame for one in settled] == list(range(16))
+
+
+def test_any_order_of_the_pixels_in_memory_will_do():
+    plain, turned = Pipeline(), Pipeline()
+    for frame in range(4):
+        image = as16(SURVEY.image(frame))
+        one = plain.process(image, stamp(frame))
+        other = turned.process(np.asfortranarray(image), stamp(frame))
+    assert one.objects.tobytes() == other.objects.tobytes()
+    assert one.detections.tobytes() == other.detections.tobytes()
+    assert len(one.detections) == 3
+
+
+def test_the_light_goes_out_and_comes_back():
+    """Frames without any light, after which all stars are as they were: no RSO, and no warning."""
+    pipeline, ids = Pipeline(), set()
+    for frame in range(16):
+        image = as16(SURVEY.image(0))
+        dark = frame in (8, 9)
+        result = pipeline.process(np.zeros_like(image) if dark else image, stamp(frame))
+        ids |= set(result.detections["track_id"].tolist())
+    assert ids == set()
+
+
+def test_what_was_learned_of_another_camera_is_forgotten():
+    pipeline = Pipeline()
+    random = np.random.default_rng(4)
+    for frame in range(12):
+        pipeline.process(random.normal(1000, 300, (64, 64)).astype(np.uint16), stamp(frame))
+    for frame in range(12, 16):
+        image = random.normal(100, 5, (64, 64)).astype(np.uint8)
+        image[20, 30] = 180
+        pipeline.process(image, stamp(frame))
+    rows, columns = pipeline._sensor.defects(
+        np.zeros((64, 64), np.float32), 5.0, np.dtype(np.uint8)
+    )
+    assert (rows.tolist(), columns.tolist()) == ([20], [30])

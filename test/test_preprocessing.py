@@ -582,7 +582,7 @@ def test_the_memory_does_not_change_the_image():
     image = (noise(SENSOR, level=0) + pattern((0, 0, 300))).astype(np.float32)
     before = image.copy()
     for _ in range(3):
-        rows, columns = memory.defects(image, 20.0)
+        rows, columns = memory.defects(image, 20.0, np.dtype(np.uint16))
         # and what is beside them, over 6 sigmas by chance
         assert {*zip(rows, columns, strict=True)} >= {*zip(*GRID, strict=True)}
     assert np.array_equal(image, before)

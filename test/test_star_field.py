@@ -313,3 +313,17 @@ def test_field_rotation_from_images(engine):
     # 0.06 px per star at a typical 150 px from the centre, 190 stars: 3e-5 rad
     assert result.star_field.rotation == pytest.approx(rotation, abs=1.5e-4)
     assert result.star_field.scale == pytest.approx(0, abs=1.5e-4)
+
+
+def test_two_of_many_vectors_are_no_field():
+    """A field that turns faster than vectors are found leaves a few that agree by chance."""
+    random = np.random.default_rng(6)
+    position = random.uniform(0, 256, (60, 2))
+    displacement = random.uniform(-40, 40, (60, 2))
+    displacement[:3] = (5.0, 3.0)
+    sigma = np.full((60, 2), 0.1)
+    speed = np.hypot(*displacement.T)
+    assert estimate_motion(position, displacement, sigma, speed, (256, 256)) is None
+    displacement[:12] = (5.0, 3.0)
+    motion = estimate_motion(position, displacement, sigma, np.hypot(*displacement.T), (256, 256))
+    assert motion.displacement == pytest.approx((5.0, 3.0), abs=0.1)

@@ -304,6 +304,8 @@ def _excess(
     # The two nearest in time have the most alike surroundings.
     nearest = sorted(range(len(others)), key=lambda i: abs(others[i].number - frame.number))[:2]
     around = np.max([others[i].envelope_at(places[i]) for i in nearest], axis=0)
+    # Those may not see the place, or see it dark; what shines there is near it in any case.
+    around = np.maximum(around, star)
     noise = frame.noise_at(pixels)
     known = np.maximum(count, 1)
     has_star = star > 1.5 * noise / np.sqrt(known)
