@@ -90,7 +90,7 @@ def test_signals_end_every_node_within_a_second(number, tmp_path):
     bag = write_bag(tmp_path / "bag", sky(2), topic="/nobody")
     arguments = {
         "detector": (),  # it works on the simulator's images when the signal comes
-        "simulator": ("--ros-args", "-p", "rate:=20.0"),
+        "simulator": ("--ros-args", "-p", "rate:=5.0"),
         "player": (f"{bag}",),
         "recorder": ("--ros-args", "-p", f"output:={tmp_path / 'output'}"),
     }
