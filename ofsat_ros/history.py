@@ -9,23 +9,24 @@ mount does.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
+from ofsat_ros.pixels import Regions, interpolate
 from ofsat_ros.star_field import StarFieldMotion
 
 Array = NDArray[np.float64]
 Plane = NDArray[np.float32]
 
-# cv2.remap takes images of points up to 32,767 on a side: a list of points becomes rows of these.
-_ROW = 1024
 # How far around a pixel the envelope looks for a brighter star, px.
-_ENVELOPE_PX = 2
+_AROUND = np.arange(-2, 3)
 # Cubic interpolation looks this far beyond a point, px.
 _MARGIN = 2
 
@@ -48,10 +49,12 @@ class PastFrame:
         Local noise over it, on a mesh of equal cells.
     objects : (N,) OBJECT_DTYPE
         Its objects.
-    labels : (H, W) int32
-        1 + index of the object at each pixel, 0 for none.
+    regions : Regions
+        The objects' pixels.
     to_sky, from_sky : (3, 3) float64
         Homogeneous matrices from px to the sky plane, and back.
+    bright : (M,) intp
+        Flat indices, ascending, of the pixels that spots may be made of.
     """
 
     number: int
@@ -60,8 +63,9 @@ class PastFrame:
     noise: float
     noise_ratio: Plane
     objects: NDArray[np.void]
-    labels: NDArray[np.int32]
+    regions: Regions
     to_sky: Array
+    bright: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
     from_sky: Array = field(init=False)
 
     def __post_init__(self) -> None:
@@ -73,12 +77,6 @@ class PastFrame:
         return self.smoothed.shape[0], self.smoothed.shape[1]
 
     @cached_property
-    def envelope(self) -> Plane:
-        """Highest value of `smoothed` within 2 px of each pixel, (H, W): is it beside a star."""
-        side = 2 * _ENVELOPE_PX + 1
-        return cv2.dilate(self.smoothed, np.ones((side, side), np.uint8))
-
-    @cached_property
     def object_sky(self) -> Array:
         """The objects' centroids in the sky plane, (N, 2)."""
         return self.sky(np.stack([self.objects["x"], self.objects["y"]], axis=1))
@@ -86,10 +84,13 @@ class PastFrame:
     @cached_property
     def object_light(self) -> Array:
         """The smoothed brightness summed over each object's pixels, (N,) DN."""
-        labels = self.labels.ravel()
-        inside = np.flatnonzero(labels)
-        light = self.smoothed.ravel()[inside]
-        return np.bincount(labels[inside], light, len(self.objects) + 1)[1:].astype(np.float64)
+        light = self.smoothed.ravel()[self.regions.pixels]
+        return np.bincount(self.regions.owner, light, len(self.objects)).astype(np.float64)
+
+    @cached_property
+    def object_tree(self) -> KDTree:
+        """Their places in the sky plane, for searches."""
+        return KDTree(self.object_sky)
 
     def sky(self, xy: Array) -> Array:
         """Points (N, 2) px of this frame in the sky plane, (N, 2)."""
@@ -106,36 +107,71 @@ class PastFrame:
     def contains(self, xy: Array, margin: float = 0.0) -> NDArray[np.bool_]:
         """Whether points (N, 2) px are at least `margin` px inside the image, (N,)."""
         height, width = self.shape
-        limit = np.array([width - 1 - margin, height - 1 - margin])
-        return np.all((xy >= margin) & (xy <= limit), axis=1)
+        x, y = xy[:, 0], xy[:, 1]
+        across = (x >= margin) & (x <= width - 1 - margin)
+        return across & (y >= margin) & (y <= height - 1 - margin)
 
-    def brightness(self, xy: Array) -> Plane:
-        """Smoothed brightness between the pixels by cubic interpolation, (N,) DN.
+    def seen_by(self, others: Sequence[PastFrame], xy: NDArray[Any]) -> tuple[Plane, Plane, Plane]:
+        """How other frames show the places of the sky at points of this one.
 
-        NaN within 2 px of the border and outside, where there is nothing to interpolate between.
+        Parameters
+        ----------
+        others : sequence of F PastFrame
+            Frames of the same size.
+        xy : (N, 2) float or int
+            Points, px.
+
+        Returns
+        -------
+        brightness : (F, N) float32
+            Smoothed brightness by cubic interpolation, DN; NaN within 2 px of the border and
+            outside, where there is nothing to interpolate between.
+        x, y : (F, N) float32
+            Where the points are in each, px.
         """
-        inside = self.contains(xy, _MARGIN)
-        rows = -(-len(xy) // _ROW)
-        grid = np.zeros((rows * _ROW, 2), np.float32)
-        grid[: len(xy)] = np.where(inside[:, None], xy, 0)
-        x, y = (np.ascontiguousarray(grid[:, axis].reshape(rows, _ROW)) for axis in (0, 1))
-        if not rows:
-            return np.zeros(0, np.float32)
-        values = cv2.remap(self.smoothed, x, y, cv2.INTER_CUBIC).ravel()[: len(xy)]
-        return np.where(inside, values, np.float32(np.nan))
+        matrix = np.array([other.from_sky for other in others]) @ self.to_sky
+        # Single precision knows a pixel of a large image to 0.0003.
+        points = np.ascontiguousarray(xy.T, np.float32)
+        x, y = (
+            matrix[:, axis, :1].astype(np.float32) * points[0]
+            + matrix[:, axis, 1:2].astype(np.float32) * points[1]
+            + matrix[:, axis, 2:].astype(np.float32)
+            for axis in (0, 1)
+        )
+        height, width = self.shape
+        outside = (x < _MARGIN) | (x > width - 1 - _MARGIN)
+        outside |= (y < _MARGIN) | (y > height - 1 - _MARGIN)
+        brightness = np.stack(
+            [
+                interpolate(other.smoothed, across, down, cv2.INTER_CUBIC)
+                for other, across, down in zip(others, x, y, strict=True)
+            ]
+        )
+        brightness[outside] = np.nan
+        return brightness, x, y
 
     def noise_at(self, pixels: NDArray[np.intp]) -> Array:
         """Std of the background in `smoothed` at pixels (N, 2), (N,) DN."""
         rows, columns = self.noise_ratio.shape
+        if rows * columns == 1:
+            return np.full(len(pixels), self.noise * float(self.noise_ratio[0, 0]))
         x = pixels[:, 0] * columns // self.shape[1]
         y = pixels[:, 1] * rows // self.shape[0]
         return self.noise * self.noise_ratio[y, x].astype(np.float64)
 
-    def envelope_at(self, xy: Array) -> Plane:
-        """`envelope` at the pixels nearest to points (N, 2) px, (N,) DN; 0 outside."""
-        inside = self.contains(xy)
-        x, y = np.where(inside[:, None], np.rint(xy), 0).astype(np.intp).T
-        return np.where(inside, self.envelope[y, x], np.float32(0))
+    def envelope_at(self, x: Plane, y: Plane) -> Plane:
+        """Highest value of `smoothed` within 2 px of the pixels nearest to points, (N,) DN.
+
+        0 for points (x, y), (N,) px each, outside.  It says whether a pixel lies beside a star.
+        """
+        height, width = self.shape
+        inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+        column, row = (np.rint(np.where(inside, axis, 0)).astype(np.intp) for axis in (x, y))
+        rows = np.minimum(np.maximum(row[:, None] + _AROUND, 0), height - 1) * width
+        columns = np.minimum(np.maximum(column[:, None] + _AROUND, 0), width - 1)
+        near = self.smoothed.ravel().take(rows[:, :, None] + columns[:, None, :])
+        highest = near.reshape(len(x), len(_AROUND) ** 2).max(axis=1, initial=0)
+        return np.where(inside, highest, np.float32(0))
 
 
 class History:

@@ -1,16 +1,18 @@
 """Objects: one measurement per connected region of the thresholded image.
 
-Second stage: takes the mask and the images of ``preprocessing``; what follows measures the flow
-of these objects.  An object is a star, an RSO or an artefact; this stage does not tell which.
+Second stage: takes what ``preprocessing`` found above the threshold; what follows measures the
+flow of these objects.  An object is a star, an RSO or an artefact; this stage does not tell which.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from ofsat_ros.pixels import Regions, connected, rows_and_columns
+
+Index = NDArray[np.intp]
 
 OBJECT_DTYPE = np.dtype(
     [
@@ -31,22 +33,21 @@ OBJECT_DTYPE = np.dtype(
 # A second peak of a region is an object of its own if it stands this far over the valley between
 # them: in sigmas, and in parts of itself.
 _PROMINENCE_SIGMAS, _PROMINENCE_RATIO = 5.0, 0.3
-# Levels at which a valley is looked for, and peaks of a region that are looked at.
-_LEVEL_STEP, _MOST_PEAKS = 1.25, 20
-_AROUND = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0)]
+# A valley counts as high as the next of the levels that lead down from the second peak by this.
+_LEVEL_STEP = 1.25
 
 
 def find_objects(
-    image: NDArray[np.float32],
+    pixels: Index,
+    values: NDArray[np.floating],
     smoothed: NDArray[np.float32],
-    mask: NDArray[np.uint8],
     pixel_noise: float,
     noise: float,
     noise_ratio: NDArray[np.float32],
     min_area_px: int = 1,
     max_objects: int = 5000,
-) -> tuple[NDArray[np.void], NDArray[np.int32]]:
-    """Measure the connected regions of a mask.
+) -> tuple[NDArray[np.void], Regions]:
+    """Measure the connected regions of the pixels above the threshold.
 
     The position is the mean of the region's pixels weighted by the square of the smoothed
     brightness, which is what a window as wide as the star does: wings that are mostly noise count
@@ -60,12 +61,14 @@ def find_objects(
 
     Parameters
     ----------
-    image, smoothed : (H, W) float32
-        The image and its smoothed version, DN, less their background.
-    mask : (H, W) uint8
-        Nonzero inside objects.
+    pixels : (M,) intp
+        Flat indices, ascending, of the pixels above the threshold.
+    values : (M,) float
+        The image there less its background, DN.
+    smoothed : (H, W) float32
+        The image less its background, smoothed, DN.
     pixel_noise, noise : float
-        Std of the background in `image` and in `smoothed`, DN, greater than 0.
+        Std of the background before and after smoothing, DN, greater than 0.
     noise_ratio : (ny, nx) float32
         Local noise over these, on a mesh of equal cells over the image.
     min_area_px : int
@@ -77,132 +80,192 @@ def find_objects(
     -------
     objects : (N,) OBJECT_DTYPE
         Sorted by SNR, the largest first.
-    labels : (H, W) int32
-        1 + index of the object that a pixel belongs to, 0 for none.
+    regions : Regions
+        The pixels of each.
     """
-    inside = cv2.findNonZero(mask)
-    labels = np.zeros(mask.shape, np.int32)
-    if inside is None:
-        return np.zeros(0, OBJECT_DTYPE), labels
-    count, regions = cv2.connectedComponents(mask, connectivity=8, ltype=cv2.CV_32S)
-    x, y = inside.reshape(-1, 2).T.astype(np.intp)
-    count = _split(regions, count, x, y, smoothed, noise)
+    shape = (smoothed.shape[0], smoothed.shape[1])
+    if not pixels.size:
+        return np.zeros(0, OBJECT_DTYPE), Regions(shape)
+    region, count = connected(pixels, shape[1])
+    # Most regions are noise of a pixel or two.
+    large = (np.bincount(region, minlength=count) >= min_area_px)[region]
+    region, pixels, values = region[large], pixels[large], values[large]
+    light = smoothed.ravel()[pixels]
+    region, count = _split(region, count, pixels, light, smoothed, noise)
     # What lies between the parts of a split region belongs to none.
-    x, y = x[regions[y, x] > 0], y[regions[y, x] > 0]
+    inside = region >= 0
+    pixels, raw, light = pixels[inside], values[inside].astype(np.float64), light[inside]
     # A part may be left without a pixel.
-    region = regions[y, x]
-    present = np.bincount(region, minlength=count) > 0
-    region = (np.cumsum(present) - 1)[region]
-    count = int(np.count_nonzero(present)) + 1
-    moments = _moments(region, count - 1, x, y, smoothed[y, x].astype(np.float64), noise)
+    present = np.bincount(region[inside], minlength=count) > 0
+    region, count = (np.cumsum(present) - 1)[region[inside]], int(np.count_nonzero(present))
+    y, x = rows_and_columns(pixels, shape[1])
+    moments = _moments(region, count, x, y, light.astype(np.float64), noise)
 
     def total(weights: NDArray[np.generic] | None = None) -> NDArray[np.float64]:
-        return np.bincount(region, weights, count - 1).astype(np.float64)
+        return np.bincount(region, weights, count).astype(np.float64)
 
-    raw = image[y, x].astype(np.float64)
     area = total()
-    local = _sample_mesh(noise_ratio, moments["x"], moments["y"], mask.shape)
+    local = _sample_mesh(noise_ratio, moments["x"], moments["y"], shape)
     energy = total(raw * raw) / (pixel_noise * local) ** 2 - area
     snr = np.maximum(moments["peak"] / (noise * local), np.sqrt(np.maximum(energy, 0)))
-    objects = np.zeros(count - 1, OBJECT_DTYPE)
+    order = np.flatnonzero(area >= min_area_px)
+    order = order[np.argsort(-snr[order], kind="stable")][:max_objects]
+    objects = np.zeros(count, OBJECT_DTYPE)
     objects["flux"], objects["snr"], objects["area"] = total(raw), snr, area
     for name in ("x", "y", "peak"):
         objects[name] = moments[name]
     for name, moment in (("sigma_x", moments["xx"]), ("sigma_y", moments["yy"])):
         objects[name] = np.sqrt(2 * moment * moments["untruncated"]) / np.maximum(snr, 1)
     objects["length"], objects["angle"] = _streak(moments, snr)
-    height, width = mask.shape
-    at_border = (x == 0) | (y == 0) | (x == width - 1) | (y == height - 1)
-    objects["edge"] = total(at_border) > 0
-
-    order = np.flatnonzero(area >= min_area_px)
-    order = order[np.argsort(-snr[order], kind="stable")][:max_objects]
-    rank = np.zeros(count - 1, np.int32)
-    rank[order] = np.arange(1, order.size + 1)
-    labels[y, x] = rank[region]
-    return objects[order], labels
+    at_border = (x == 0) | (y == 0) | (x == shape[1] - 1) | (y == shape[0] - 1)
+    objects["edge"][region[at_border]] = True
+    owner = np.full(count, -1)
+    owner[order] = np.arange(order.size)
+    owner = owner[region]
+    return objects[order], Regions(shape, pixels[owner >= 0], owner[owner >= 0])
 
 
 def _split(
-    regions: NDArray[np.int32],
+    region: Index,
     count: int,
-    x: NDArray[np.intp],
-    y: NDArray[np.intp],
+    pixels: Index,
+    light: NDArray[np.float32],
     smoothed: NDArray[np.float32],
     noise: float,
-) -> int:
-    """Split, in place, regions of several bright peaks into one for each; return the new count.
+) -> tuple[Index, int]:
+    """Split regions of several bright peaks into one for each.
 
     A faint object in a bright one's wings is in the same region, but the way between their peaks
     leads through a valley.
+
+    Returns
+    -------
+    region : (M,) intp
+        Region of each pixel; -1 between the parts of a split one.
+    count : int
+        How many there are.
     """
+    width = smoothed.shape[1]
+    bright = np.flatnonzero(light > 2 * _PROMINENCE_SIGMAS * noise)
+    peaks = bright[_is_top(pixels[bright], light[bright], smoothed)]
+    several = np.bincount(region[peaks], minlength=count) > 1
+    if not several.any():
+        return region, count
+    # The pixels and peaks of these regions only, region by region, the brightest peak first.
+    mine = np.flatnonzero(several[region])
+    own, pixels, light = region[mine], pixels[mine], light[mine]
+    peaks = np.searchsorted(mine, peaks[several[region[peaks]]])
+    peaks = peaks[np.lexsort((-light[peaks], own[peaks]))]
+    valley = _valleys(pixels, light, width)[peaks]
+    peaks = peaks[_stands_out(own[peaks], light[peaks], valley, noise)]
+    region = region.copy()
+    for label in np.flatnonzero(np.bincount(own[peaks], minlength=count) > 1):
+        rows = np.flatnonzero(own == label)
+        tops = np.searchsorted(rows, peaks[own[peaks] == label])
+        part = _parts(pixels[rows], light[rows], tops, width, noise)
+        # The first part keeps the region's number.
+        region[mine[rows]] = np.where(part > 1, count + part - 2, np.where(part == 1, label, -1))
+        count += int(part.max()) - 1
+    return region, count
+
+
+def _stands_out(
+    own: Index, height: NDArray[np.float32], valley: NDArray[np.float32], noise: float
+) -> NDArray[np.bool_]:
+    """Which peaks are objects of their own, (P,).
+
+    `own` is the region of each, ascending; the first one of a region is its brightest, and its
+    valley -inf.
+    """
+    first = np.diff(own, prepend=-1) != 0
+    second = height[np.flatnonzero(first) + 1][np.cumsum(first) - 1]
+    steps = np.floor(np.log(second / np.maximum(valley, noise)) / np.log(_LEVEL_STEP))
+    level = second / _LEVEL_STEP**steps
+    least = _PROMINENCE_SIGMAS * noise
+    needed = np.maximum(least, _PROMINENCE_RATIO * height)
+    return (height - level > needed) | (level <= least * _LEVEL_STEP)
+
+
+def _is_top(
+    pixels: Index, light: NDArray[np.float32], smoothed: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """Which pixels, of brightness `light`, have no brighter one around them, (M,)."""
     height, width = smoothed.shape
-    bright = smoothed[y, x] > 2 * _PROMINENCE_SIGMAS * noise
-    px, py = x[bright], y[bright]
-    for dy, dx in _AROUND:
-        beside = smoothed[np.clip(py + dy, 0, height - 1), np.clip(px + dx, 0, width - 1)]
-        top = smoothed[py, px] >= beside
-        px, py = px[top], py[top]
-    owner = regions[py, px]
-    several = np.flatnonzero(np.bincount(owner, minlength=count) > 1)
-    several = several[several > 0]
-    if not several.size:
-        return count
-    # The region's box, from its pixels in order.
-    mine = np.isin(regions[y, x], several)
-    mx, my, mr = x[mine], y[mine], regions[y[mine], x[mine]]
-    order = np.argsort(mr, kind="stable")
-    starts = np.searchsorted(mr[order], several)
-    ends = np.searchsorted(mr[order], several, side="right")
-    for label, start, end in zip(several, starts, ends, strict=True):
-        rows = order[start:end]
-        left, top_row = mx[rows].min(), my[rows].min()
-        box = np.s_[top_row : my[rows].max() + 1, left : mx[rows].max() + 1]
-        own = regions[box] == label
-        peaks = np.flatnonzero(owner == label)
-        peaks = peaks[np.argsort(-smoothed[py[peaks], px[peaks]])][:_MOST_PEAKS]
-        places = np.stack([py[peaks] - top_row, px[peaks] - left], axis=1)
-        parts = _parts(np.where(own, smoothed[box], 0), places, noise)
-        if parts is None:
-            continue
-        for part in range(1, parts.max() + 1):
-            regions[box][parts == part] = label if part == 1 else count
-            count += part > 1
-        regions[box][own & (parts == 0)] = 0
-    return count
+    flat = smoothed.ravel()
+    y, x = rows_and_columns(pixels, width)
+    left, right = -(x > 0).astype(np.intp), (x < width - 1).astype(np.intp)
+    top = light >= np.maximum(flat[pixels + left], flat[pixels + right])
+    some = np.flatnonzero(top)
+    pixels, light, y, left, right = pixels[some], light[some], y[some], left[some], right[some]
+    for row in (pixels - width * (y > 0), pixels + width * (y < height - 1)):
+        top[some] &= light >= flat[[row + left, row, row + right]].max(axis=0)
+    return top
+
+
+def _valleys(pixels: Index, light: NDArray[np.float32], width: int) -> NDArray[np.float32]:
+    """Lowest point of the best way from each pixel to a brighter one, (M,); -inf without a way.
+
+    Whatever surrounds a top joins it, from the highest pass to it down: so each pixel learns at
+    what height it meets a brighter one, in as many rounds as the tops are nested.
+    """
+    order = np.argsort(-light, kind="stable")
+    rank = np.empty_like(order)
+    rank[order] = np.arange(order.size)
+    one, other = _neighbours(pixels, width)
+    passes = np.minimum(light[one], light[other])
+    one, other = rank[one], rank[other]
+    valley = np.full(order.size, -np.inf, np.float32)
+    root = np.arange(order.size)
+    while passes.size:
+        fainter, brighter = np.maximum(one, other), np.minimum(one, other)
+        highest = np.full(order.size, -np.inf, np.float32)
+        np.maximum.at(highest, one, passes)
+        np.maximum.at(highest, other, passes)
+        joins = passes == highest[fainter]
+        valley[fainter[joins]] = passes[joins]
+        root[fainter[joins]] = brighter[joins]
+        shorter = root[root]
+        while not np.array_equal(shorter, root):
+            root, shorter = shorter, shorter[shorter]
+        one, other = root[one], root[other]
+        apart = one != other
+        one, other, passes = one[apart], other[apart], passes[apart]
+    return valley[rank]
+
+
+def _neighbours(pixels: Index, width: int) -> tuple[Index, Index]:
+    """Pairs of the pixels, by their places in the list, that touch: a side or a corner."""
+    _, x = rows_and_columns(pixels, width)
+    firsts, seconds = [], []
+    for down, right in ((0, 1), (1, -1), (1, 0), (1, 1)):
+        one = np.flatnonzero((x + right >= 0) & (x + right < width))
+        sought = pixels[one] + down * width + right
+        other = np.searchsorted(pixels[:-1], sought)
+        there = pixels[other] == sought
+        firsts.append(one[there])
+        seconds.append(other[there])
+    return np.concatenate(firsts), np.concatenate(seconds)
 
 
 def _parts(
-    light: NDArray[np.float32], peaks: NDArray[np.intp], noise: float
-) -> NDArray[np.int32] | None:
-    """Part of a region that each pixel belongs to, from 1, and 0 between them.
+    pixels: Index, light: NDArray[np.float32], peaks: Index, width: int, noise: float
+) -> NDArray[np.int32]:
+    """Part of a region that each of its pixels belongs to, from 1, and 0 between them, (M,).
 
-    None if no second of its peaks, (P, 2) rows and columns, the brightest first, stands out.
+    A part for each of the peaks, which are places in the list of pixels, the brightest first.
     """
-    height = light[peaks[:, 0], peaks[:, 1]]
-    alive = np.ones(len(peaks), bool)
-    valley = np.zeros(len(peaks))
-    level = float(height[1]) / _LEVEL_STEP
-    while level > _PROMINENCE_SIGMAS * noise and not valley[1:].all():
-        _, labels = cv2.connectedComponents((light > level).astype(np.uint8), connectivity=8)
-        at = labels[peaks[:, 0], peaks[:, 1]]
-        for fainter in np.flatnonzero((height > level) & (valley == 0)):
-            if fainter and np.any(at[:fainter] == at[fainter]):
-                # Somewhere between this level and the one before.
-                valley[fainter] = level * _LEVEL_STEP
-                needed = max(_PROMINENCE_SIGMAS * noise, _PROMINENCE_RATIO * height[fainter])
-                alive[fainter] = height[fainter] - valley[fainter] > needed
-        level /= _LEVEL_STEP
-    if np.count_nonzero(alive) < 2:
-        return None
+    y, x = rows_and_columns(pixels, width)
     # The flood leaves out the border of its image.
-    light, peaks = np.pad(light, 1), peaks + 1
-    markers = np.where(light > 0, 0, len(peaks) + 1).astype(np.int32)
-    for part, (row, column) in enumerate(peaks[alive], start=1):
-        markers[row, column] = part
-    grey = 255 * (1 - np.log1p(light / noise) / np.log1p(height[0] / noise))
-    flood = cv2.watershed(np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2), markers)
-    return np.where((flood > 0) & (flood <= len(peaks)), flood, 0)[1:-1, 1:-1]
+    y, x = y - y.min() + 1, x - x.min() + 1
+    outside = len(peaks) + 1
+    markers = np.full((y.max() + 2, x.max() + 2), outside, np.int32)
+    markers[y, x] = 0
+    markers[y[peaks], x[peaks]] = np.arange(1, outside)
+    grey = np.full(markers.shape, 255, np.uint8)
+    grey[y, x] = 255 * (1 - np.log1p(light / noise) / np.log1p(light[peaks[0]] / noise))
+    cv2.watershed(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), markers)
+    part = markers[y, x]
+    return np.where((part > 0) & (part < outside), part, 0)
 
 
 def _moments(
@@ -218,20 +281,23 @@ def _moments(
     np.minimum.at(lowest, region, value)
     np.maximum.at(peak, region, value)
     # Every weight is positive, also where a published threshold lies below the background.
-    weight = value - np.minimum(lowest[region], 0) + 1e-6 * noise
+    weight = value - np.minimum(lowest, 0)[region] + 1e-6 * noise
 
-    def mean(values: NDArray[Any], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.bincount(region, weights * values, count) / np.bincount(region, weights, count)
+    def total(weights: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.bincount(region, weights, count).astype(np.float64)
 
-    cx, cy = mean(x, weight**2), mean(y, weight**2)
+    square = weight * weight
+    squares, weights = total(square), total(weight)
+    cx, cy = total(square * x) / squares, total(square * y) / squares
     dx, dy = x - cx[region], y - cy[region]
+    weighted = weight * dx
     return {
         "x": cx,
         "y": cy,
         # A pixel is a square of side 1: its variance keeps a single pixel from having none.
-        "xx": mean(dx * dx, weight) + 1 / 12,
-        "yy": mean(dy * dy, weight) + 1 / 12,
-        "xy": mean(dx * dy, weight),
+        "xx": total(weighted * dx) / weights + 1 / 12,
+        "yy": total(weight * dy * dy) / weights + 1 / 12,
+        "xy": total(weighted * dy) / weights,
         "peak": peak,
         "untruncated": _untruncated(lowest / np.maximum(peak, 1e-9)),
     }

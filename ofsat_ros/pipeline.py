@@ -27,6 +27,7 @@ from ofsat_ros.history import History, PastFrame
 from ofsat_ros.objects import OBJECT_DTYPE, find_objects
 from ofsat_ros.optical_flow import Flow, FlowInput, flow_engine
 from ofsat_ros.parameters import Parameters
+from ofsat_ros.pixels import Regions
 from ofsat_ros.preprocessing import Preprocessed, SensorMemory, preprocess
 from ofsat_ros.star_field import StarFieldMotion, estimate_motion, vote_shift
 from ofsat_ros.tracking import TRACK_DTYPE, Settled, Tracker
@@ -150,6 +151,8 @@ class Pipeline:
         look = partial(spot_near, radius_px=_CLOSER_PX, least_sigmas=_CLOSER_SIGMAS)
         self._tracker = Tracker(look, refine)
         self._settled: list[Settled] = []
+        # The smoothed image of a frame that has left the history: fresh memory costs time.
+        self._spare: NDArray[np.float32] | None = None
         self._last_motion: StarFieldMotion | None = None
         self._blind = 0
         self._reset_reason = "first frame"
@@ -199,7 +202,7 @@ class Pipeline:
         result = FrameResult(stamp_ns, self._frames, (image.shape[0], image.shape[1]))
         with _timed(result.seconds, "preprocessing"):
             try:
-                pre = preprocess(image, parameters, self._sensor)
+                pre = preprocess(image, parameters, self._sensor, self._spare)
             except ValueError as error:
                 raise ImageError(str(error)) from error
         self._frames += 1
@@ -209,10 +212,10 @@ class Pipeline:
             pre.threshold,
         )
         with _timed(result.seconds, "objects"):
-            result.objects, labels = find_objects(
-                pre.image,
+            result.objects, regions = find_objects(
+                pre.above,
+                pre.image_at(pre.above),
                 pre.smoothed,
-                pre.mask,
                 pre.pixel_noise,
                 pre.noise,
                 pre.noise_ratio,
@@ -222,7 +225,7 @@ class Pipeline:
         xy, sigma = _pairs(result.objects, "x", "y"), _pairs(result.objects, "sigma_x", "sigma_y")
         length = result.objects["length"]
         current = FlowInput(
-            pre.smoothed, pre.mask, pre.pedestal, labels, xy, sigma, length, pre.noise
+            pre.smoothed, pre.above, pre.pedestal, regions, xy, sigma, length, pre.noise
         )
 
         previous = self._usable_previous(image, stamp_ns, parameters)
@@ -231,7 +234,7 @@ class Pipeline:
             result.dt_s = (stamp_ns - previous.stamp_ns) / 1e9
             self._compare(previous, current, result, parameters)
         if parameters.rso_test == "history":
-            self._remember(pre, labels, result, parameters)
+            self._remember(pre, regions, result, parameters)
             self._track(pre.defects, result, parameters)
         else:
             self._forget()
@@ -326,7 +329,7 @@ class Pipeline:
     def _remember(
         self,
         pre: Preprocessed,
-        labels: NDArray[np.int32],
+        regions: Regions,
         result: FrameResult,
         parameters: Parameters,
     ) -> None:
@@ -345,6 +348,8 @@ class Pipeline:
             self._forget()
         self._last_motion = motion or self._last_motion
         to_sky = self._history.place(self._last_motion)
+        full = len(self._history) == self._history.length
+        self._spare = self._history[0].smoothed if full else None
         self._history.add(
             PastFrame(
                 number=result.frame,
@@ -353,7 +358,8 @@ class Pipeline:
                 noise=pre.noise,
                 noise_ratio=pre.noise_ratio,
                 objects=result.objects,
-                labels=labels,
+                regions=regions,
+                bright=pre.bright,
                 to_sky=to_sky,
             )
         )
@@ -370,13 +376,12 @@ class Pipeline:
             spots = [
                 find_spots(frame, history.others(frame), parameters.spot_sigmas) for frame in fresh
             ]
-            drifts = find_drifting(history, log_limit)
         result.spot_count = len(spots[-1])
         with _timed(result.seconds, "tracking"):
             tracked = self._tracker.update(
                 history,
                 spots,
-                drifts,
+                partial(find_drifting, history, log_limit),
                 defects,
                 log_limit,
                 parameters.max_speed_px,

@@ -7,6 +7,7 @@ import numpy as np
 from ofsat_ros.detection import SPOT_DTYPE
 from ofsat_ros.history import PastFrame
 from ofsat_ros.objects import OBJECT_DTYPE
+from ofsat_ros.pixels import Regions
 
 # Place of something in a frame, px, by the frame's number.
 Path = Callable[[float], np.ndarray]
@@ -23,7 +24,7 @@ def frame_of(number: int, side: int = 256, to_sky: np.ndarray | None = None) -> 
         noise=1.0,
         noise_ratio=np.ones((1, 1), np.float32),
         objects=np.zeros(0, OBJECT_DTYPE),
-        labels=np.zeros((side, side), np.int32),
+        regions=Regions((side, side)),
         to_sky=np.eye(3) if to_sky is None else to_sky,
     )
 

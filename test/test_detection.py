@@ -9,6 +9,7 @@ from ofsat_ros.objects import OBJECT_DTYPE
 from ofsat_ros.optical_flow import Flow, FlowInput
 from ofsat_ros.parameters import Parameters
 from ofsat_ros.pipeline import Pipeline
+from ofsat_ros.pixels import Regions
 from ofsat_ros.star_field import StarFieldMotion
 
 SHAPE = (100, 120)
@@ -58,9 +59,9 @@ def frame(*xy, peak=100.0, noise=1.0):
     none = np.zeros((0, 2))
     return FlowInput(
         smoothed=smoothed.astype(np.float32),
-        mask=np.zeros(SHAPE, np.uint8),
+        above=np.zeros(0, np.intp),
         pedestal=0.0,
-        labels=np.zeros(SHAPE, np.int32),
+        regions=Regions(SHAPE),
         xy=none,
         sigma=none,
         length=np.zeros(0),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from blobs import blobs, camera, flux_of_snr, scattered
 
+from ofsat_ros.detection import drift as drift_module
 from ofsat_ros.detection import find_drifting
 from ofsat_ros.history import History, PastFrame
 from ofsat_ros.objects import find_objects
@@ -25,7 +26,7 @@ def past(image, number, shift, dt_s):
     """A frame as the pipeline puts it into the history; its place on the sky is given."""
     pre = preprocess(image, Parameters())
     measured = pre.pixel_noise, pre.noise, pre.noise_ratio
-    objects, labels = find_objects(pre.image, pre.smoothed, pre.mask, *measured)
+    objects, regions = find_objects(pre.above, pre.image_at(pre.above), pre.smoothed, *measured)
     to_sky = np.eye(3)
     to_sky[:2, 2] = -np.multiply(shift, number)
     return PastFrame(
@@ -35,7 +36,8 @@ def past(image, number, shift, dt_s):
         noise=pre.noise,
         noise_ratio=pre.noise_ratio,
         objects=objects,
-        labels=labels,
+        regions=regions,
+        bright=pre.bright,
         to_sky=to_sky,
     )
 
@@ -157,6 +159,32 @@ def test_the_limit_of_false_ones_decides():
     assert len(logs) == 2
     assert len(find_drifting(history, (logs[0] + logs[1]) / 2)) == 1
     assert find_drifting(history, logs[0] - 1) == []
+
+
+def test_objects_that_tracks_have_are_not_looked_at():
+    history, objects = history_of(np.random.default_rng(15), FIELDS[1], (0.6, 0.0), 20)
+    both = assert_found(history, objects)
+    rows = [drift.rows[FRAMES - 1] for drift in both]
+    assert find_drifting(history, LOG_LIMIT, rows) == []
+    # nor does it change what is said of the other
+    assert find_drifting(history, LOG_LIMIT, rows[:1]) == both[1:]
+    assert find_drifting(history, LOG_LIMIT, np.array(rows[1:])) == both[:1]
+
+
+@pytest.mark.parametrize("speed", [0.2, 0.6])
+def test_stars_that_stand_still_are_not_followed(monkeypatch, speed):
+    history, objects = history_of(np.random.default_rng(16), FIELDS[0], (speed, 0.0), 40)
+    followed, follow = [], drift_module._follow
+
+    def recorded(frame, earlier, times, rows):
+        followed.extend(rows)
+        return follow(frame, earlier, times, rows)
+
+    monkeypatch.setattr(drift_module, "_follow", recorded)
+    found = {drift.rows[FRAMES - 1] for drift in assert_found(history, objects)}
+    assert found <= set(followed)
+    # beside the two: what is at the border, or was not seen in the two oldest frames
+    assert len(followed) <= 2 + 4 < len(history[-1].objects)
 
 
 # Stars

@@ -7,6 +7,7 @@ import pytest
 
 from ofsat_ros.history import History, PastFrame
 from ofsat_ros.objects import OBJECT_DTYPE
+from ofsat_ros.pixels import Regions
 from ofsat_ros.star_field import StarFieldMotion, estimate_motion
 
 SHAPE = (90, 120)
@@ -27,9 +28,16 @@ def past(number=0, smoothed=None, to_sky=None, objects=(), labels=None, noise=1.
         noise=noise,
         noise_ratio=np.array(ratio, np.float32),
         objects=table,
-        labels=np.zeros(smoothed.shape, np.int32) if labels is None else labels,
+        regions=Regions(SHAPE) if labels is None else Regions.of_labels(labels),
         to_sky=np.eye(3) if to_sky is None else np.array(to_sky, float),
     )
+
+
+def brightness(frame, xy):
+    """What a frame shows at points of its own."""
+    (seen,), (x,), (y,) = frame.seen_by([frame], xy)
+    np.testing.assert_allclose(np.stack([x, y], axis=1), xy, atol=1e-3, rtol=1e-6)
+    return seen
 
 
 def similarity(degrees, zoom, shift):
@@ -176,7 +184,7 @@ def gaussian_frame(places):
 def test_brightness_between_the_pixels(count):
     place = np.array([[60.3, 40.8]])
     xy = np.random.default_rng(count).uniform(place - 4, place + 4, (count, 2))
-    got = gaussian_frame(place).brightness(xy)
+    got = brightness(gaussian_frame(place), xy)
     assert got.dtype == np.float32
     # Cubic interpolation of so narrow a Gaussian errs by 2 % of its peak; OpenCV rounds places to
     # 1/32 px, which at the steepest, 0.43 of the peak per px and axis, is 0.9 % more.
@@ -188,7 +196,7 @@ def test_brightness_on_the_pixels_is_theirs():
     frame = past(smoothed=smoothed)
     y, x = np.mgrid[2 : SHAPE[0] - 2, 2 : SHAPE[1] - 2]
     xy = np.stack([x.ravel(), y.ravel()], axis=1).astype(float)
-    np.testing.assert_allclose(frame.brightness(xy), smoothed[2:-2, 2:-2].ravel(), atol=1e-4)
+    np.testing.assert_allclose(brightness(frame, xy), smoothed[2:-2, 2:-2].ravel(), atol=1e-4)
 
 
 def test_at_the_border_there_is_nothing_to_interpolate_between():
@@ -199,10 +207,10 @@ def test_at_the_border_there_is_nothing_to_interpolate_between():
         *((1.99, 40), (60, 1.99), (right - 1.99, 40), (60, bottom - 1.99), (0, 0)),
         *((-5, 40), (60, -5), (200, 40), (60, 1e6), (-1e6, -1e6)),
     ]
-    got = frame.brightness(np.array(inside + outside, float))
+    got = brightness(frame, np.array(inside + outside, float))
     assert got[: len(inside)] == pytest.approx(7, abs=1e-5)
     assert np.isnan(got[len(inside) :]).all()
-    assert frame.brightness(np.zeros((0, 2))).shape == (0,)
+    assert brightness(frame, np.zeros((0, 2))).shape == (0,)
 
 
 def test_a_point_is_contained_up_to_the_last_pixels_centre():
@@ -216,11 +224,12 @@ def test_the_envelope_is_the_brightest_within_two_pixels():
     smoothed = np.zeros(SHAPE)
     smoothed[40, 60], smoothed[0, 0] = 500, 80
     frame = past(smoothed=smoothed)
-    lit = np.argwhere(frame.envelope == 500)
+    y, x = np.indices(SHAPE).reshape(2, -1)
+    lit = np.argwhere(frame.envelope_at(x, y).reshape(SHAPE) == 500)
     assert (lit.min(axis=0).tolist(), lit.max(axis=0).tolist()) == ([38, 58], [42, 62])
     assert len(lit) == 25
     xy = [(60, 40), (62.4, 42.4), (62.6, 40), (60, 37.4), (2, 2), (3, 0), (-1, 0), (60, 300)]
-    assert frame.envelope_at(np.array(xy)).tolist() == [500, 500, 0, 0, 80, 0, 0, 0]
+    assert frame.envelope_at(*np.array(xy).T).tolist() == [500, 500, 0, 0, 80, 0, 0, 0]
 
 
 def test_the_noise_is_that_of_the_cell():

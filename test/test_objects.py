@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, label
 from scipy.special import erf
 
-from ofsat_ros.objects import OBJECT_DTYPE, find_objects
+from ofsat_ros.objects import OBJECT_DTYPE, _valleys, find_objects
 
 PSF = 1.0
 NOISE = 10.0
@@ -43,7 +43,15 @@ def find(image: np.ndarray, noise: float = NOISE, count: float = 4.0, **options)
     image = image.astype(np.float32)
     smoothed = gaussian_filter(image, 1.0)
     mask = (smoothed > count * noise * SMOOTHED).astype(np.uint8)
-    return find_objects(image, smoothed, mask, noise, noise * SMOOTHED, ONE, **options)
+    return measure(image, smoothed, mask, noise, noise * SMOOTHED, ONE, **options)
+
+
+def measure(image, smoothed, mask, *noise, **options):
+    """Objects of a mask, and the labels of all pixels."""
+    pixels = np.flatnonzero(mask)
+    values, smoothed = image.ravel()[pixels], smoothed.astype(np.float32)
+    objects, regions = find_objects(pixels, values, smoothed, *noise, **options)
+    return objects, regions.labels()
 
 
 def measure_points(snr: float, trials: int = 400) -> tuple[np.ndarray, np.ndarray, float]:
@@ -131,7 +139,7 @@ def test_local_noise_counts():
     smoothed = gaussian_filter(image, 1.0).astype(np.float32)
     mask = (smoothed > 20).astype(np.uint8)
     ratio = np.array([[1.0, 2.0]], np.float32)
-    objects, _ = find_objects(image.astype(np.float32), smoothed, mask, NOISE, 2.8, ratio)
+    objects, _ = measure(image.astype(np.float32), smoothed, mask, NOISE, 2.8, ratio)
     assert objects["x"] == pytest.approx([32, 96], abs=1e-3)
     assert objects["snr"][0] == pytest.approx(2 * objects["snr"][1], rel=0.01)
     assert objects["sigma_x"][1] == pytest.approx(2 * objects["sigma_x"][0], rel=0.01)
@@ -179,7 +187,7 @@ def test_the_angle_of_an_upright_streak_is_never_minus_ninety_degrees():
         x, column = random.integers(5, 34), random.uniform(1, 9, 20)
         image[10:30, x] = image[10:30, x + 1] = column
         mask = (image > 0).astype(np.uint8)
-        objects, _ = find_objects(image, image, mask, 1.0, 1.0, ONE)
+        objects, _ = measure(image, image, mask, 1.0, 1.0, ONE)
         assert -math.pi / 2 < objects["angle"][0] <= math.pi / 2
         assert abs(objects["angle"][0]) == pytest.approx(math.pi / 2, abs=1e-9)
 
@@ -197,7 +205,7 @@ def test_angles_go_from_x_to_y():
 
 def test_an_empty_mask_gives_nothing():
     zero = np.zeros((20, 30), np.float32)
-    objects, labels = find_objects(zero, zero, zero.astype(np.uint8), 1.0, 1.0, ONE)
+    objects, labels = measure(zero, zero, zero.astype(np.uint8), 1.0, 1.0, ONE)
     assert (objects.dtype, objects.shape) == (OBJECT_DTYPE, (0,))
     assert (labels.dtype, labels.shape) == (np.int32, (20, 30))
     assert not labels.any()
@@ -205,7 +213,7 @@ def test_an_empty_mask_gives_nothing():
 
 def test_a_full_mask_is_one_object():
     image = np.full((20, 30), 50, np.float32)
-    objects, labels = find_objects(image, image, np.ones((20, 30), np.uint8), 1.0, 1.0, ONE)
+    objects, labels = measure(image, image, np.ones((20, 30), np.uint8), 1.0, 1.0, ONE)
     assert len(objects) == 1
     assert (objects["x"][0], objects["y"][0]) == pytest.approx((14.5, 9.5))
     assert (objects["area"][0], objects["edge"][0]) == (600, True)
@@ -219,7 +227,7 @@ def test_regions_below_the_background_are_measured():
     mask = np.zeros((20, 20), np.uint8)
     mask[5:8, 10:13] = 1
     image[5, 10] = -1
-    objects, _ = find_objects(image, image, mask, 1.0, 1.0, ONE)
+    objects, _ = measure(image, image, mask, 1.0, 1.0, ONE)
     # Over the region's lowest, the corner is all there is.
     assert (objects["x"][0], objects["y"][0]) == pytest.approx((10, 5), abs=1e-3)
     assert objects["flux"][0] == -5 * 8 - 1
@@ -302,7 +310,7 @@ def test_the_mask_is_not_split_in_the_callers_array():
     smoothed = gaussian_filter(image.astype(np.float32), 1.0)
     mask = (smoothed > 4 * NOISE * SMOOTHED).astype(np.uint8)
     before = mask.copy()
-    find_objects(image.astype(np.float32), smoothed, mask, NOISE, NOISE * SMOOTHED, ONE)
+    measure(image.astype(np.float32), smoothed, mask, NOISE, NOISE * SMOOTHED, ONE)
     assert np.array_equal(mask, before)
 
 
@@ -310,7 +318,7 @@ def test_corners_connect():
     mask = np.zeros((20, 20), np.uint8)
     mask[5, 5] = mask[6, 6] = 1
     image = 10.0 * mask.astype(np.float32)
-    objects, _ = find_objects(image, image, mask, 1.0, 1.0, ONE)
+    objects, _ = measure(image, image, mask, 1.0, 1.0, ONE)
     assert objects["area"].tolist() == [2]
     assert (objects["x"][0], objects["y"][0]) == pytest.approx((5.5, 5.5))
 
@@ -319,7 +327,7 @@ def test_one_pixel_has_a_finite_measurement():
     mask = np.zeros((20, 20), np.uint8)
     mask[5, 7] = 1
     image = 30.0 * mask.astype(np.float32)
-    objects, _ = find_objects(image, image, mask, 1.0, 1.0, ONE)
+    objects, _ = measure(image, image, mask, 1.0, 1.0, ONE)
     found = objects[0]
     assert (found["x"], found["y"], found["area"], found["length"]) == (7, 5, 1, 0)
     # The pixel's own moment, and twice as much std for what the threshold may have cut: the
@@ -379,7 +387,7 @@ def test_inputs_are_not_changed():
     smoothed = gaussian_filter(image, 1.0)
     mask = (smoothed > 12).astype(np.uint8)
     before = image.copy(), smoothed.copy(), mask.copy()
-    find_objects(image, smoothed, mask, NOISE, 2.8, ONE, 3, 2)
+    measure(image, smoothed, mask, NOISE, 2.8, ONE, 3, 2)
     for old, new in zip(before, (image, smoothed, mask), strict=True):
         assert np.array_equal(old, new)
 
@@ -388,8 +396,8 @@ def test_any_nonzero_mask_counts():
     image = several().astype(np.float32)
     smoothed = gaussian_filter(image, 1.0)
     mask = (smoothed > 12).astype(np.uint8)
-    one, _ = find_objects(image, smoothed, mask, NOISE, 2.8, ONE)
-    other, _ = find_objects(image, smoothed, 255 * mask, NOISE, 2.8, ONE)
+    one, _ = measure(image, smoothed, mask, NOISE, 2.8, ONE)
+    other, _ = measure(image, smoothed, 255 * mask, NOISE, 2.8, ONE)
     assert np.array_equal(one, other)
 
 
@@ -424,3 +432,24 @@ def test_a_noisy_streak_is_not_split(length: float, sigmas: float):
         # lone pixels of noise beside it have less
         assert np.count_nonzero(objects["snr"] > 7) == 1, seed
         assert (objects["x"][0], objects["y"][0]) == pytest.approx((x, y), abs=0.1 * length)
+
+
+def test_a_valley_is_the_best_ways_lowest_point():
+    """Against its definition: the highest level above which a way to a brighter pixel stays."""
+    random = np.random.default_rng(3)
+    light = gaussian_filter(random.normal(0, 1, (14, 17)), 1.0).astype(np.float32)
+    light[4:6, 5:8] = light.max() + 1
+    light[light < np.quantile(light, 0.3)] = -9
+    pixels = np.flatnonzero(light > -9)
+    values = light.ravel()[pixels]
+    brightest_first = np.argsort(-values, kind="stable")
+    expected = np.full(pixels.size, -np.inf)
+    for level in np.unique(values):
+        regions, _ = label(light >= level, np.ones((3, 3)))
+        region = regions.ravel()[pixels]
+        led = set()
+        for pixel in brightest_first[region[brightest_first] > 0]:
+            if region[pixel] in led:
+                expected[pixel] = level
+            led.add(region[pixel])
+    np.testing.assert_array_equal(_valleys(pixels, values, light.shape[1]), expected)

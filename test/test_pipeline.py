@@ -803,7 +803,7 @@ def test_what_was_learned_of_another_camera_is_forgotten():
         image = random.normal(100, 5, (64, 64)).astype(np.uint8)
         image[20, 30] = 180
         pipeline.process(image, stamp(frame))
-    rows, columns = pipeline._sensor.defects(
-        np.zeros((64, 64), np.float32), 5.0, np.dtype(np.uint8)
-    )
-    assert (rows.tolist(), columns.tolist()) == ([20], [30])
+    memory = pipeline._sensor
+    memory.begin((64, 64), 5.0, np.dtype(np.uint8))
+    memory.add(np.zeros((64, 64), np.float32), 0)
+    assert memory.finish().tolist() == [20 * 64 + 30]

@@ -4,8 +4,9 @@ Fifth stage.  `detect` compares two frames, as published; `find_spots` and `find
 a frame with the history and leave it to ``tracking`` to tell RSOs from noise.
 """
 
-from ofsat_ros.detection.appearance import BORDER_PX, SPOT_DTYPE, find_spots, refine, spot_near
+from ofsat_ros.detection.appearance import BORDER_PX, SPOT_DTYPE, find_spots, spot_near
 from ofsat_ros.detection.drift import Drift, find_drifting
+from ofsat_ros.detection.refinement import refine
 from ofsat_ros.detection.two_frames import CANDIDATE, CONFIRMED, DETECTION_DTYPE, detect
 
 __all__ = [

@@ -7,16 +7,18 @@ against the oldest frames, with the uncertainty that its own gradients give, dec
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
+from scipy.ndimage import maximum_filter
 
 from ofsat_ros.history import History, PastFrame
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 # An object is sought this near to its place in the frame before, px of the sky plane.
 _REACH_PX = 3.0
@@ -30,11 +32,17 @@ _CENTROID_FLOOR_PX = 0.02
 # Registration and shape may move what Lucas-Kanade measures by this much, px.
 _FLOW_FLOOR_PX = 0.1
 _LEAST_DRIFT_PX = 0.8
+# What was seen within so many sigmas of its place, or half the least drift, stands still.
+_STILL_SIGMAS = 3.0
 _FLOW_SIGMAS = 5.5
+# Lucas-Kanade ends after so many steps, or when one is as short as this, or it has lost its way.
+_STEPS, _LAST_STEP_PX, _LOST_PX = 8, 0.01, 8.0
 # Window of the flow: its half side, and the sigma of its weights, px.
 _HALF_PX, _WEIGHT_PX = 5, 2.5
 _STEP = np.arange(-_HALF_PX, _HALF_PX + 1, dtype=float)
 _DX, _DY = np.meshgrid(_STEP, _STEP)
+# A matrix that takes the columns of a window to their gradients.
+_GRADIENT = np.asarray(np.gradient(np.eye(len(_STEP)), axis=0))
 _WEIGHT = np.exp(-(_DX**2 + _DY**2) / (2 * _WEIGHT_PX**2))
 # Noise smoothed with sigma 1 px is correlated: a sum over pixels varies by 4 pi sigma^2 as much.
 _CORRELATED = 4 * np.pi
@@ -56,49 +64,37 @@ class Drift:
     log_false: float
 
 
-@dataclass
-class _Chains:
-    """The paths of the newest frame's objects, as sums for straight lines through them."""
+class _Lines:
+    """Straight lines of constant speed through the paths of objects.
 
-    count: Array
-    t: Array
-    tt: Array
-    xy: Array
-    txy: Array
-    variance: Array
+    Parameters
+    ----------
+    times : (K,) float64
+        Of the frames, s.
+    places : (N, K) complex128
+        Places of the objects in the sky plane, x + iy px; 0 where they were not found.
+    found : (N, K) bool
+        Where they were; at least once each.
+    """
 
-    @classmethod
-    def starting_at(cls, xy: Array, variance: Array) -> _Chains:
-        zero = np.zeros(len(xy))
-        return cls(zero + 1, zero.copy(), zero.copy(), xy.copy(), 0 * xy, variance.copy())
+    def __init__(self, times: Array, places: NDArray[np.complex128], found: Mask) -> None:
+        self.count = found.sum(axis=1)
+        self._time = found @ times / self.count
+        self._place = places.sum(axis=1) / self.count
+        since = np.where(found, times - self._time[:, None], 0)
+        # sum of the squared times from their mean, s^2
+        self.spread = np.einsum("nk,nk->n", since, since)
+        slope = np.einsum("nk,nk->n", since, places) / np.maximum(self.spread, 1e-12)
+        self.long_enough = self.count >= _LEAST_FRAMES
+        # px/s; 0 where they have no time to move
+        self.velocity = np.where(self.long_enough, slope, 0)
 
-    def add(self, rows: NDArray[np.intp], t: float, xy: Array, variance: Array) -> None:
-        self.count[rows] += 1
-        self.t[rows] += t
-        self.tt[rows] += t * t
-        self.xy[rows] += xy
-        self.txy[rows] += t * xy
-        self.variance[rows] += variance
-
-    @property
-    def spread(self) -> Array:
-        """Sum of the squared times from their mean, s^2."""
-        return self.tt - self.t**2 / self.count
-
-    @property
-    def velocity(self) -> Array:
-        """Of the lines, px/s; 0 where they have no time to move."""
-        top = self.txy - (self.t / self.count)[:, None] * self.xy
-        usable = (self.count >= _LEAST_FRAMES)[:, None]
-        return np.where(usable, top / np.maximum(self.spread, 1e-12)[:, None], 0)
-
-    def at(self, t: float) -> Array:
-        """Points of the lines, px of the sky plane."""
-        middle = self.xy / self.count[:, None]
-        return middle + self.velocity * (t - self.t / self.count)[:, None]
+    def at(self, t: float) -> NDArray[np.complex128]:
+        """Points of the lines, (N,)."""
+        return self._place + self.velocity * (t - self._time)
 
 
-def find_drifting(history: History, log_limit: float) -> list[Drift]:
+def find_drifting(history: History, log_limit: float, known: Collection[int] = ()) -> list[Drift]:
     """Find objects of the newest frame that drift against the stars.
 
     Parameters
@@ -107,158 +103,254 @@ def find_drifting(history: History, log_limit: float) -> list[Drift]:
         The frames, the current one last.
     log_limit : float
         Logarithm of the number of false ones in one frame that is accepted.
+    known : collection of int
+        Rows of the newest frame's objects that need not be looked at: tracks have them already.
 
     Returns
     -------
     list of Drift
     """
     frame = history[-1]
-    objects = frame.objects
     earlier = list(history)[-2::-1]
-    if len(earlier) < _LEAST_FRAMES - 1 or not len(objects):
+    if len(earlier) < _LEAST_FRAMES - 1 or not len(frame.objects):
         return []
-    chains, rows, places = _chains(frame, earlier)
-    times = np.array([_seconds(other, frame) for other in earlier])
+    still, scale = _stand_still(frame, earlier)
+    still[list(known)] = True
+    followed = np.flatnonzero(~still)
+    times = np.array([_seconds(other, frame) for other in (frame, *earlier)])
+    rows, places, variance = _follow(frame, earlier, times, followed)
     found = rows >= 0
-    long_enough = np.flatnonzero(chains.count >= _LEAST_FRAMES)
-    if not long_enough.size:
-        return []
-    error = np.sqrt(chains.variance / chains.count + _CENTROID_FLOOR_PX**2)
-    speed = np.hypot(*chains.velocity.T)
-    significance = speed * np.sqrt(chains.spread) / error
-    # Most objects are stars: what their significances scatter by beyond 1 is an error of scale.
-    significance /= max(1.0, float(np.median(significance[long_enough])) / 1.18)
-    residual = places - np.stack([chains.at(t) for t in times], axis=1)
-    rms = np.sqrt(np.nansum(residual**2, axis=(1, 2)) / np.maximum(found.sum(axis=1), 1))
+    lines = _Lines(times, places, found)
+    error = np.sqrt(variance.sum(axis=1) / lines.count + _CENTROID_FLOOR_PX**2)
+    speed = np.abs(lines.velocity)
+    significance = speed * np.sqrt(lines.spread) / error / scale
+    log_false = np.log(len(frame.objects)) - significance**2 / 2
+    # The newest frame, where all were found, is no test.
+    residual = (lines.at(0.0)[:, None] + lines.velocity[:, None] * times - places)[:, 1:]
+    hits = lines.count - 1
+    rms = np.sqrt(np.sum(np.abs(residual) ** 2 * found[:, 1:], axis=1) / np.maximum(hits, 1))
     drift = speed * np.max(np.where(found, -times, 0), axis=1)
-    log_false = np.log(long_enough.size) - significance**2 / 2
-    suspect = (chains.count >= _LEAST_FRAMES) & (log_false < log_limit)
-    oldest = np.max(np.where(found, np.arange(1, len(earlier) + 1), 0), axis=1)
-    hits = found.sum(axis=1)
+    oldest = np.max(np.where(found, np.arange(len(times)), 0), axis=1)
+    suspect = lines.long_enough & (log_false < log_limit)
     suspect &= hits >= _HITS_PER_MISS * (oldest - hits)
     suspect &= (drift > _LEAST_DRIFT_PX) & (drift > 3.5 * rms)
     suspect &= rms < np.maximum(0.3, 3 * error)
-    suspect &= frame.contains(_xy(objects), _HALF_PX + 1)
-    drifting = []
-    for row in np.flatnonzero(suspect).tolist():
-        seen = [(other, t) for other, t, ok in zip(earlier, times, found[row], strict=True) if ok]
-        if _flow_agrees(frame, seen, row, chains.velocity[row]):
-            in_frames = {
-                o.number: int(r) for o, r in zip(earlier, rows[row], strict=True) if r >= 0
-            }
-            in_frames[frame.number] = int(row)
-            drifting.append(Drift(in_frames, float(log_false[row])))
-    return drifting
-
-
-def _chains(frame: PastFrame, earlier: list[PastFrame]) -> tuple[_Chains, NDArray[np.intp], Array]:
-    """Follow every object back through the frames.
-
-    Returns the paths, the row of the object in each earlier frame (-1: not found), (N, K), and
-    its place in the sky plane, (N, K, 2).
-    """
-    objects = frame.objects
-    last = frame.object_sky.copy()
-    chains = _Chains.starting_at(last, _variance(objects))
-    rows = np.full((len(objects), len(earlier)), -1, np.intp)
-    places = np.full((len(objects), len(earlier), 2), np.nan)
-    misses = np.where(objects["edge"], 9, 0)
-    for column, other in enumerate(earlier):
-        if not len(other.objects):
-            continue
-        t = _seconds(other, frame)
-        expected = np.where((chains.count >= _LEAST_FRAMES)[:, None], chains.at(t), last)
-        distance, nearest = KDTree(other.object_sky).query(
-            expected, distance_upper_bound=_REACH_PX
+    suspect &= frame.contains(_xy(frame.objects[followed]), _HALF_PX + 1)
+    chosen = np.flatnonzero(suspect)
+    if not chosen.size:
+        return []
+    velocity = _points(lines.velocity[chosen])
+    agrees = _flow_agrees(frame, earlier, followed[chosen], found[chosen, 1:], velocity)
+    numbers = [other.number for other in (frame, *earlier)]
+    return [
+        Drift(
+            {n: int(r) for n, r in zip(numbers, rows[row], strict=True) if r >= 0},
+            float(log_false[row]),
         )
-        near = np.flatnonzero((distance < _REACH_PX) & (misses <= _MOST_MISSES))
-        there = nearest[near]
-        ratio = other.objects["flux"][there] / np.maximum(objects["flux"][near], 1e-9)
-        alike = (ratio < _FLUX_RATIO) & (ratio > 1 / _FLUX_RATIO) & ~other.objects["edge"][there]
-        near, there = near[alike], there[alike]
-        rows[near, column] = there
-        last[near] = places[near, column] = other.object_sky[there]
-        chains.add(near, t, last[near], _variance(other.objects)[there])
-        misses += rows[:, column] < 0
-    return chains, rows, places
+        for row in chosen[agrees].tolist()
+    ]
 
 
-def _flow_agrees(
-    frame: PastFrame, seen: list[tuple[PastFrame, float]], row: int, velocity: Array
-) -> bool:
-    """Whether Lucas-Kanade against the frames in which it was seen finds the same drift."""
-    moved: list[float] = []
-    agreement: list[float] = []
-    xy = _xy(frame.objects)[row]
-    x, y = np.rint(xy).astype(int)
-    labels = frame.labels[y - _HALF_PX : y + _HALF_PX + 1, x - _HALF_PX : x + _HALF_PX + 1]
-    # A brighter neighbour in the window, and its wings, would be what is measured.
-    others = ((labels != 0) & (labels != row + 1)).astype(np.uint8)
-    weight = np.where(cv2.dilate(others, np.ones((5, 5), np.uint8)) > 0, 0, _WEIGHT)
-    for other, t in seen:
-        expected = np.linalg.solve(frame.to_sky[:2, :2], -velocity * t)
-        if np.hypot(*expected) < _LEAST_DRIFT_PX / 2:
-            continue
-        drift, covariance = _flow_against_field(frame, other, xy, weight)
-        precision = np.linalg.inv(covariance)
-        off = drift - expected
-        moved.append(float(np.sqrt(drift @ precision @ drift)))
-        agreement.append(moved[-1] / max(float(np.sqrt(off @ precision @ off)), 0.5))
-    if not moved:
-        return False
-    return max(moved) > _FLOW_SIGMAS and float(np.median(agreement)) > 2
-
-
-def _flow_against_field(
-    frame: PastFrame, other: PastFrame, xy: Array, weight: Array
-) -> tuple[Array, Array]:
-    """Displacement against the field of what is at a point, by iterated Lucas-Kanade in float.
-
-    The weights are those of the pixels of the window around the point.
+def _stand_still(frame: PastFrame, earlier: list[PastFrame]) -> tuple[NDArray[np.bool_], float]:
+    """Which objects one of the two oldest frames shows where they are now: most stars.
 
     Returns
     -------
-    drift : (2,) float64
-        From where the field's motion carries the other frame to where it is now, px.
-    covariance : (2, 2) float64
+    still : (N,) bool
+    scale : float
+        How many times as much as stated the centroids of all scatter, at least 1: as most objects
+        are stars, what they scatter by beyond their stds is an error of scale.
+    """
+    objects = frame.objects
+    variance = _variance(objects) + _CENTROID_FLOOR_PX**2
+    reach = np.maximum(_LEAST_DRIFT_PX / 2, _STILL_SIGMAS * np.sqrt(variance))
+    rest = np.flatnonzero(~objects["edge"])
+    rows, distance = _at_places(earlier[-1], frame.object_sky[rest], objects["flux"][rest])
+    seen = rows >= 0
+    scale = 1.0
+    if seen.any():
+        both = variance[rest[seen]] + _variance(earlier[-1].objects[rows[seen]])
+        sigmas = distance[seen] / np.sqrt(both + _CENTROID_FLOOR_PX**2)
+        # the median of the distance of two axes' noise
+        scale = max(scale, float(np.median(sigmas)) / 1.18)
+    rest = rest[distance >= reach[rest]]
+    _, distance = _at_places(earlier[-2], frame.object_sky[rest], objects["flux"][rest])
+    still = ~objects["edge"]
+    still[rest] = distance < reach[rest]
+    return still, scale
+
+
+def _at_places(other: PastFrame, sky: Array, flux: Array) -> tuple[NDArray[np.intp], Array]:
+    """Rows of a frame's objects on whose pixels points lie and that are alike, and how far off.
+
+    -1 and infinity where there is none.
+    """
+    xy = other.pixels(sky)
+    inside = np.flatnonzero(other.contains(xy))
+    x, y = np.rint(xy[inside]).astype(np.intp).T
+    row = other.regions.at(y, x)
+    inside, row = inside[row >= 0], row[row >= 0]
+    alike = _alike(other, row, flux[inside])
+    inside, row = inside[alike], row[alike]
+    rows, distance = np.full(len(sky), -1), np.full(len(sky), np.inf)
+    rows[inside] = row
+    distance[inside] = np.hypot(*(other.object_sky[row] - sky[inside]).T)
+    return rows, distance
+
+
+def _nearest(other: PastFrame, sky: Array, flux: Array) -> NDArray[np.intp]:
+    """Rows of a frame's objects that are nearest to points, in reach and alike, else -1, (N,)."""
+    if not (len(sky) and len(other.objects)):
+        return np.full(len(sky), -1)
+    distance, row = other.object_tree.query(sky)
+    return np.where((distance < _REACH_PX) & _alike(other, row, flux), row, -1)
+
+
+def _alike(other: PastFrame, row: NDArray[np.intp], flux: Array) -> NDArray[np.bool_]:
+    """Whether objects of a frame are as bright as told, (N,), and whole."""
+    ratio = other.objects["flux"][row] / np.maximum(flux, 1e-9)
+    return (ratio < _FLUX_RATIO) & (ratio > 1 / _FLUX_RATIO) & ~other.objects["edge"][row]
+
+
+def _follow(
+    frame: PastFrame, earlier: list[PastFrame], times: Array, followed: NDArray[np.intp]
+) -> tuple[NDArray[np.intp], NDArray[np.complex128], Array]:
+    """Follow objects back through the frames.
+
+    Returns the row of each in each frame, the newest first (-1: not found), its place in the sky
+    plane, x + iy, and the variance of the centroid, 0 where it was not found; (N, K).
+    """
+    objects = frame.objects[followed]
+    shape = len(followed), len(times)
+    rows, places = np.full(shape, -1, np.intp), np.zeros(shape, np.complex128)
+    variance = np.zeros(shape)
+    last = _complex(frame.object_sky[followed])
+    rows[:, 0], places[:, 0], variance[:, 0] = followed, last, _variance(objects)
+    misses = np.where(objects["edge"], _MOST_MISSES + 1, 0)
+    for column, other in enumerate(earlier, start=1):
+        before = np.s_[:, :column]
+        lines = _Lines(times[:column], places[before], rows[before] >= 0)
+        expected = np.where(lines.long_enough, lines.at(times[column]), last)
+        there = _nearest(other, _points(expected), objects["flux"])
+        near = np.flatnonzero((there >= 0) & (misses <= _MOST_MISSES))
+        there = there[near]
+        rows[near, column], variance[near, column] = there, _variance(other.objects[there])
+        last[near] = places[near, column] = _complex(other.object_sky[there])
+        misses += rows[:, column] < 0
+    return rows, places, variance
+
+
+def _flow_agrees(
+    frame: PastFrame,
+    earlier: list[PastFrame],
+    rows: NDArray[np.intp],
+    found: NDArray[np.bool_],
+    velocity: Array,
+) -> NDArray[np.bool_]:
+    """Whether Lucas-Kanade against the frames in which they were seen finds the same drifts, (N,).
+
+    `found` tells in which of the earlier frames each object was seen, (N, K).
+    """
+    times = np.array([_seconds(other, frame) for other in earlier])
+    expected = -velocity[:, None] * times[:, None] @ np.linalg.inv(frame.to_sky[:2, :2]).T
+    which, against = np.nonzero(found & (np.hypot(*expected.T).T >= _LEAST_DRIFT_PX / 2))
+    if not which.size:
+        return np.zeros(len(rows), bool)
+    xy, weight = _xy(frame.objects)[rows], _weights(frame, rows)
+    drift, covariance = _flow_against_field(frame, earlier, against, xy[which], weight[which])
+    precision = np.linalg.inv(covariance)
+
+    def sigmas(vectors: Array) -> Array:
+        return np.sqrt(np.einsum("ni,nij,nj->n", vectors, precision, vectors))
+
+    moved, agreement = np.zeros(found.shape), np.full(found.shape, np.nan)
+    moved[which, against] = sigmas(drift)
+    off = sigmas(drift - expected[which, against])
+    agreement[which, against] = moved[which, against] / np.maximum(off, 0.5)
+    # none to compare with is no agreement
+    agreement[np.isnan(agreement).all(axis=1), 0] = 0
+    return (moved.max(axis=1) > _FLOW_SIGMAS) & (np.nanmedian(agreement, axis=1) > 2)
+
+
+def _weights(frame: PastFrame, rows: NDArray[np.intp]) -> Array:
+    """Weights of the pixels of the windows around objects, (N, side, side).
+
+    A brighter neighbour in the window, and its wings, would be what is measured.
+    """
+    pixels = np.rint(_xy(frame.objects)[rows][:, None, None] + np.stack([_DX, _DY], axis=-1))
+    x, y = pixels.astype(np.intp).transpose(3, 0, 1, 2)
+    owner = frame.regions.at(y, x)
+    others = (owner >= 0) & (owner != rows[:, None, None])
+    return np.where(maximum_filter(others, (1, 5, 5), mode="constant"), 0, _WEIGHT)
+
+
+def _flow_against_field(
+    frame: PastFrame,
+    earlier: list[PastFrame],
+    against: NDArray[np.intp],
+    xy: Array,
+    weight: Array,
+) -> tuple[Array, Array]:
+    """Displacement against the field of what is at points, by iterated Lucas-Kanade in float.
+
+    Point by point, `against` is the index of the earlier frame that it is compared with, and the
+    weights are those of the pixels of the window around it.
+
+    Returns
+    -------
+    drift : (N, 2) float64
+        From where the field's motion carries the earlier frame to where it is now, px.
+    covariance : (N, 2, 2) float64
         Of it, px^2: the noise through the normal equations, so that it is large along a streak,
         where there is no gradient.
     """
-    now = _patch(frame.smoothed, xy[0] + _DX, xy[1] + _DY)
-    noise = (frame.noise**2 + other.noise**2) * _CORRELATED
-    drift = np.zeros(2)
-    for _ in range(8):
-        points = np.stack([xy[0] + _DX - drift[0], xy[1] + _DY - drift[1]], axis=-1)
-        places = other.pixels_of(frame, points.reshape(-1, 2)).reshape(points.shape)
-        before = _patch(other.smoothed, places[..., 0], places[..., 1])
-        gy, gx = (np.asarray(axis) for axis in np.gradient((now + before) / 2))
-        change = now - before
-        normal = _normal(gx, gy, weight)
-        right = -np.array([np.sum(weight * gx * change), np.sum(weight * gy * change)])
+    window = xy[:, None, None] + np.stack([_DX, _DY], axis=-1)
+    now = _patches(frame, window)
+    noise = np.array([frame.noise**2 + other.noise**2 for other in earlier])[against]
+    noise = noise[:, None, None] * _CORRELATED
+    to_earlier = np.array([other.from_sky @ frame.to_sky for other in earlier])[against, :2]
+    turn, shift = to_earlier[:, None, :, :2].swapaxes(2, 3), to_earlier[:, None, None, :, 2]
+    drift = np.zeros((len(xy), 2))
+    normal, scatter = np.zeros((len(xy), 2, 2)), np.zeros((len(xy), 2, 2))
+    going = np.arange(len(xy))
+    for _ in range(_STEPS):
+        points = (window[going] - drift[going, None, None]) @ turn[going] + shift[going]
+        before = np.empty((len(going), *_WEIGHT.shape))
+        for index in np.unique(against[going]):
+            some = against[going] == index
+            before[some] = _patches(earlier[index], points[some])
+        mean = (now[going] + before) / 2
+        gradient = np.stack([mean @ _GRADIENT.T, _GRADIENT @ mean], axis=1)
+        gradient = gradient.reshape(len(going), 2, -1)
+        flat = weight[going].reshape(len(going), 1, -1)
+        change = (now[going] - before).reshape(len(going), -1, 1)
+        across = gradient.transpose(0, 2, 1)
+        normal[going] = (flat * gradient) @ across
+        scatter[going] = (flat**2 * gradient) @ across
         # The noise's own gradients keep the step small where there are no others.
-        step = np.linalg.solve(normal + noise * np.eye(2), right)
-        drift += step
-        if np.hypot(*step) < 0.01 or np.hypot(*drift) > 8:
+        regular = normal[going] + noise[going] * np.eye(2)
+        step = -np.linalg.solve(regular, (flat * gradient) @ change)[..., 0]
+        drift[going] += step
+        ends = np.hypot(*step.T) < _LAST_STEP_PX
+        going = going[~ends & (np.hypot(*drift[going].T) <= _LOST_PX)]
+        if not going.size:
             break
-    inverse = np.linalg.pinv(normal + 1e-9 * np.trace(normal) * np.eye(2))
-    covariance = inverse @ (_normal(gx, gy, weight**2) * noise) @ inverse
-    return drift, covariance + _FLOW_FLOOR_PX**2 * np.eye(2)
+    trace = np.trace(normal, axis1=1, axis2=2)[:, None, None]
+    inverse = np.linalg.pinv(normal + 1e-9 * trace * np.eye(2))
+    return drift, inverse @ (scatter * noise) @ inverse + _FLOW_FLOOR_PX**2 * np.eye(2)
 
 
-def _normal(gx: Array, gy: Array, weight: Array) -> Array:
-    cross = np.sum(weight * gx * gy)
-    return np.array([[np.sum(weight * gx * gx), cross], [cross, np.sum(weight * gy * gy)]])
-
-
-def _patch(image: NDArray[np.float32], x: Array, y: Array) -> Array:
+def _patches(frame: PastFrame, points: Array) -> Array:
+    """Brightness at the points of windows (N, side, side, 2), (N, side, side)."""
+    x, y = points.reshape(-1, points.shape[2], 2).astype(np.float32).transpose(2, 0, 1)
     values = cv2.remap(
-        image,
-        x.astype(np.float32),
-        y.astype(np.float32),
+        frame.smoothed,
+        np.ascontiguousarray(x),
+        np.ascontiguousarray(y),
         cv2.INTER_CUBIC,
         borderMode=cv2.BORDER_REPLICATE,
     )
-    return values.astype(np.float64)
+    return values.astype(np.float64).reshape(points.shape[:3])
 
 
 def _seconds(other: PastFrame, frame: PastFrame) -> float:
@@ -272,3 +364,11 @@ def _xy(objects: NDArray[np.void]) -> Array:
 def _variance(objects: NDArray[np.void]) -> Array:
     """Of a centroid along one axis, px^2."""
     return (objects["sigma_x"] ** 2 + objects["sigma_y"] ** 2) / 2
+
+
+def _complex(points: Array) -> NDArray[np.complex128]:
+    return points[:, 0] + 1j * points[:, 1]
+
+
+def _points(places: NDArray[np.complex128]) -> Array:
+    return np.stack([places.real, places.imag], axis=1)

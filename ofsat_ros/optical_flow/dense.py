@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 from ofsat_ros.optical_flow.flow import Array, Flow, FlowInput, Plane, brightness_kept
 from ofsat_ros.parameters import Parameters
+from ofsat_ros.pixels import rows_and_columns
+
+Index = NDArray[np.intp]
 
 
 class DenseLucasKanade:
@@ -44,7 +47,7 @@ class DenseLucasKanade:
         runs = []
         for guess in guesses:
             velocity, solved = self.velocity_map(*images, *noise, guess)
-            runs.append(self._combine(velocity, solved, current.labels, current, len(current.xy)))
+            runs.append(self._of_objects(velocity, solved, current))
         flow = runs[0]
         kept = [
             run.valid
@@ -143,23 +146,27 @@ class DenseLucasKanade:
         speed = np.hypot(velocity[..., 0], velocity[..., 1])
         moving = solved & (current.mask > 0) & (speed > self._parameters.dense_min_speed_px)
         count, regions = cv2.connectedComponents(moving.astype(np.uint8), ltype=cv2.CV_32S)
-        flow = self._combine(velocity, moving, regions, current, count - 1)
-        index = current.object_at(flow.position)
-        return replace(flow, object_index=index)
+        y, x = np.nonzero(regions)
+        flow = self._combine(velocity, y, x, regions[y, x].astype(np.intp) - 1, count - 1)
+        return replace(flow, object_index=current.object_at(flow.position))
 
-    def _combine(
-        self,
-        velocity: Plane,
-        solved: NDArray[np.bool_],
-        labels: NDArray[np.int32],
-        current: FlowInput,
-        count: int,
-    ) -> Flow:
+    def _of_objects(self, velocity: Plane, solved: NDArray[np.bool_], current: FlowInput) -> Flow:
+        """One vector per object."""
+        y, x = rows_and_columns(current.regions.pixels, solved.shape[1])
+        inside = solved[y, x]
+        label, count = current.regions.owner[inside], len(current.xy)
+        flow = self._combine(velocity, y[inside], x[inside], label, count)
+        return replace(
+            flow,
+            position=current.xy,
+            sigma=current.displacement_sigma(),
+            object_index=np.arange(count),
+        )
+
+    def _combine(self, velocity: Plane, y: Index, x: Index, label: Index, count: int) -> Flow:
         """One vector per label: the median of its pixels', and the statistics of their speeds."""
         if count == 0:
             return Flow.empty()
-        y, x = np.nonzero((labels > 0) & solved)
-        label = labels[y, x].astype(np.intp) - 1
         order = np.argsort(label, kind="stable")
         y, x, label = y[order], x[order], label[order]
         vectors = velocity[y, x].astype(np.float64)
@@ -174,15 +181,12 @@ class DenseLucasKanade:
         low, high = np.full(count, np.inf), np.zeros(count)
         np.minimum.at(low, label, speed)
         np.maximum.at(high, label, speed)
-        objects = labels is current.labels
-        position = current.xy if objects else np.stack([mean(x), mean(y)], axis=1)
-        sigma = current.displacement_sigma() if objects else np.full((count, 2), np.sqrt(1 / 12))
         return Flow(
-            position=position,
+            position=np.stack([mean(x), mean(y)], axis=1),
             displacement=displacement,
-            sigma=sigma,
+            sigma=np.full((count, 2), np.sqrt(1 / 12)),
             valid=valid,
-            object_index=np.arange(count) if objects else np.full(count, -1),
+            object_index=np.full(count, -1),
             speed_mean=mean(speed),
             speed_median=_group_median(speed, label, number),
             speed_min=np.where(valid, low, 0),

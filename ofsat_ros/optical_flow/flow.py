@@ -8,6 +8,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ofsat_ros.pixels import Regions
+
 Array = NDArray[np.float64]
 Plane = NDArray[np.float32]
 
@@ -25,12 +27,12 @@ class FlowInput:
     ----------
     smoothed : (H, W) float32
         Smoothed image less its background, DN.
-    mask : (H, W) uint8
-        1 inside objects.
+    above : (M,) intp
+        Flat indices of the pixels above the threshold.
     pedestal : float
         What I_s as published holds of the background, DN.
-    labels : (H, W) int32
-        1 + index of the object at each pixel, 0 for none.
+    regions : Regions
+        The objects' pixels.
     xy : (N, 2) float64
         Centroids of the objects, px.
     sigma : (N, 2) float64
@@ -42,13 +44,20 @@ class FlowInput:
     """
 
     smoothed: Plane
-    mask: NDArray[np.uint8]
+    above: NDArray[np.intp]
     pedestal: float
-    labels: NDArray[np.int32]
+    regions: Regions
     xy: Array
     sigma: Array
     length: Array
     noise: float
+
+    @property
+    def mask(self) -> NDArray[np.uint8]:
+        """1 above the threshold, else 0, (H, W)."""
+        mask = np.zeros(self.smoothed.shape, np.uint8)
+        mask.ravel()[self.above] = 1
+        return mask
 
     @property
     def filtered(self) -> Plane:
@@ -84,7 +93,7 @@ class FlowInput:
     def object_at(self, xy: Array) -> NDArray[np.intp]:
         """Index of the object at points (N, 2) inside the image, (N,); -1 for none."""
         x, y = np.rint(xy).astype(np.intp).T
-        return self.labels[y, x].astype(np.intp) - 1
+        return self.regions.at(y, x)
 
     def displacement_sigma(self) -> Array:
         """Std of each object's displacement, (N, 2) px: two such centroids, and the flow's own."""
