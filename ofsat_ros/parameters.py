@@ -241,7 +241,8 @@ class Parameters(Table):
         8,
         "",
         "optical_flow",
-        "pyramid levels above the image, sparse engine; objects get them if not found without",
+        "pyramid levels above the image, sparse engine; objects get them if too few are found"
+        " without",
     )
     max_corners: int = _number(
         1000, 1, 100000, "", "optical_flow", "corners kept, sparse engine with native targets"

@@ -18,14 +18,16 @@ Array = NDArray[np.float64]
 _VOTERS = 150
 # Cells of the coarse vote, along each axis.
 _VOTE_CELLS = 512
-# Vectors among which the mode is sought that the robust fit starts from.
-_MODE_VECTORS = 400
 # A similarity has four parameters; with fewer stars than this their scatter goes into them.
 _STARS_FOR_SIMILARITY = 6
 # Of so many vectors, this part at least must share a motion that is the field's.
 _MANY_VECTORS, _LEAST_SHARE = 20, 0.1
 # Cut of Tukey's biweight, in sigmas: 95 % efficiency on Gaussian errors.
 _TUKEY = 4.685
+# The fit has converged when no vector of the field changes by more than this, px.
+_CONVERGED_PX = 1e-4
+# What the vectors say so much less of than of the rest, they do not say.
+_LEAST_CONDITION = 1e-12
 
 
 @dataclass(frozen=True)
@@ -161,43 +163,44 @@ def vote_shift(
     (2,) float64 or None
         Displacement, px per frame; None if no displacement has more votes than chance gives.
     """
-    a, b = np.argsort(-previous_flux)[:_VOTERS], np.argsort(-current_flux)[:_VOTERS]
-    if not (a.size and b.size):
+    if not (previous_flux.size and current_flux.size):
         return None
-    shift = current_xy[b][None] - previous_xy[a][:, None]
-    ratio = (
-        np.log(np.maximum(current_flux[b], 1e-9))[None]
-        - np.log(np.maximum(previous_flux[a], 1e-9))[:, None]
-    )
-    votes = shift[np.abs(ratio) < np.log(1.5)]
-    if not len(votes):
+    a, b = _brightest(previous_flux), _brightest(current_flux)
+    before, now = (np.log(np.maximum(flux, 1e-9)) for flux in (previous_flux[a], current_flux[b]))
+    alike = np.abs(now - before[:, None]) < np.log(1.5)
+    if not alike.any():
         return None
-    # First coarsely over all displacements, then finely around the best: the cost of counting is
-    # that of the cells, and a field may move by as much as the image is wide.
-    extent = float(np.max(np.ptp(votes, axis=0)))
-    coarse, chance = _densest(votes, max(bin_px, extent / _VOTE_CELLS))
+    ends = zip(previous_xy[a].T, current_xy[b].T, strict=True)
+    votes = np.stack([(end - start[:, None])[alike] for start, end in ends])
+    coarse, chance = _densest(votes, bin_px)
     few = min(a.size, b.size) == 1
-    if not few and len(coarse) < max(2.0, chance + 4 * np.sqrt(chance)):
+    if not few and coarse.shape[1] < max(2.0, chance + 4 * np.sqrt(chance)):
         return None
-    return np.median(_densest(coarse, bin_px)[0], axis=0)
+    return np.median(_densest(coarse, bin_px)[0], axis=1)
+
+
+def _brightest(flux: Array) -> NDArray[np.intp]:
+    return np.argsort(-flux)[:_VOTERS]
 
 
 def _densest(votes: Array, cell_px: float) -> tuple[Array, float]:
-    """The votes in the densest 3 x 3 cells, and how many such cells hold by chance."""
-    cell = ((votes - votes.min(axis=0)) / cell_px).astype(np.intp) + 1
-    columns, rows = cell.max(axis=0) + 2
-    counts = np.bincount(cell[:, 0] * rows + cell[:, 1], minlength=columns * rows)
+    """Of votes (2, N), those in the densest 3 x 3 cells, and how many such cells hold by chance.
+
+    The cells are larger where votes are far apart, as a field may move by as much as the image is
+    wide and the cost of counting is that of the cells: what is found is then sought in once more.
+    """
+    x, y = votes[0] - votes[0].min(), votes[1] - votes[1].min()
+    cell_px = max(cell_px, float(max(x.max(), y.max())) / _VOTE_CELLS)
+    x, y = (x / cell_px).astype(np.intp) + 1, (y / cell_px).astype(np.intp) + 1
+    columns, rows = x.max() + 2, y.max() + 2
+    # Small numbers: fresh memory costs as much time as counting.
+    counts = np.zeros((columns, rows), np.uint16)
+    np.add.at(counts.ravel(), x * rows + y, np.uint16(1))
     # A peak may lie on a cell's border: count each cell with its neighbours.
-    near = cv2.boxFilter(
-        counts.reshape(columns, rows).astype(np.float32),
-        -1,
-        (3, 3),
-        normalize=False,
-        borderType=cv2.BORDER_CONSTANT,
-    )
-    best = np.unravel_index(np.argmax(near), near.shape)
-    chance = 9 * len(votes) / max(1, int(np.count_nonzero(near)))
-    return votes[np.all(np.abs(cell - best) <= 1, axis=1)], chance
+    near = cv2.boxFilter(counts, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    best_x, best_y = np.unravel_index(np.argmax(near), near.shape)
+    chance = 9 * x.size / max(1, cv2.countNonZero(near))
+    return votes[:, (np.abs(x - best_x) <= 1) & (np.abs(y - best_y) <= 1)], chance
 
 
 def _mean_motion(
@@ -232,14 +235,13 @@ def _mean_motion(
 
 
 def _mode(displacement: Array, sigma: Array) -> NDArray[np.bool_]:
-    """Vectors near the one that most of the best-measured others are near."""
-    best = np.argsort(sigma.sum(axis=1), kind="stable")[:_MODE_VECTORS]
-    some = displacement[best]
+    """Vectors near the place where most of them are."""
     # Wide enough for a field that rotates a little, narrow enough to tell slow RSOs apart.
-    reach = 1.0 + 3 * sigma[best].mean(axis=1)
-    distance = np.hypot(*(some[:, None] - some[None]).transpose(2, 0, 1))
-    winner = some[np.argmax(np.sum(distance <= reach[:, None], axis=1))]
-    return np.hypot(*(displacement - winner).T) <= 1.0 + 3 * sigma.mean(axis=1)
+    reach = 1.0 + 3 * sigma.mean(axis=1)
+    cell_px = 2 * float(np.median(reach)) / 3
+    coarse, _ = _densest(displacement.T, cell_px)
+    winner = np.median(_densest(coarse, cell_px)[0], axis=1)
+    return np.hypot(*(displacement - winner).T) <= reach
 
 
 def _robust_fit(
@@ -252,27 +254,32 @@ def _robust_fit(
     model: str,
 ) -> StarFieldMotion:
     """Iteratively reweighted least squares with Tukey's biweight."""
-    design = _design(offset)
+    # With offsets in units of the field's size all parameters are px, of like conditioning.
+    size = max(1.0, float(np.max(np.abs(offset))))
+    design = _design(offset / size).reshape(-1, 4).T.copy()
+    measured, known = displacement.ravel(), (1 / sigma**2).ravel()
     weight = np.where(start, 1.0, 0.0)
-    values = np.zeros(4)
-    covariance = np.zeros((4, 4))
+    values, covariance = np.zeros(4), np.zeros((4, 4))
     used, spread = 2, 1.0
     for _ in range(15):
         enough = np.count_nonzero(weight) >= _STARS_FOR_SIMILARITY
         used = 4 if model == "similarity" and enough else 2
-        scaled = np.sqrt(weight)[:, None] / sigma
-        a = (design[..., :used] * scaled[..., None]).reshape(-1, used)
-        solution = np.linalg.lstsq(a, (displacement * scaled).ravel(), rcond=None)[0]
-        before, values = values, np.append(solution, np.zeros(4 - used))
-        residual = displacement - design @ values
-        normal = np.hypot(*(residual / sigma).T) / np.sqrt(2)
+        rows = design[:used]
+        weighted = rows * (np.repeat(weight, 2) * known)
+        inverse = np.linalg.pinv(weighted @ rows.T, _LEAST_CONDITION)
+        before, values = values, np.zeros(4)
+        values[:used] = inverse @ (weighted @ measured)
+        residual = measured - values @ design
+        squares = residual * residual * known
+        normal = np.sqrt((squares[::2] + squares[1::2]) / 2)
         # Errors larger than stated (blends, a distorted field) widen the scale, never narrow it.
         spread = max(1.0, 1.4826 * float(np.median(normal[weight > 0])) / 1.24)
-        weight = np.clip(1 - (normal / (_TUKEY * spread)) ** 2, 0, None) ** 2
-        covariance[:used, :used] = np.linalg.pinv(a.T @ a) * spread**2
-        if np.allclose(values, before, atol=1e-4) or not weight.any():
+        weight = np.maximum(1 - (normal / (_TUKEY * spread)) ** 2, 0) ** 2
+        if np.max(np.abs(values - before)) < _CONVERGED_PX or not weight.any():
             break
-    covariance[used:], covariance[:, used:] = 0, 0
+    units = np.array([1, 1, 1 / size, 1 / size])
+    covariance[:used, :used] = inverse * spread**2
+    values, covariance = values * units, covariance * np.outer(units, units)
     inliers = weight > 0
     if not inliers.any():
         inliers = start
@@ -283,7 +290,7 @@ def _robust_fit(
         scale=float(values[2]),
         covariance=covariance,
         inliers=inliers,
-        residual_px=float(np.sqrt(np.mean(residual[inliers] ** 2))),
+        residual_px=float(np.sqrt(np.mean(residual.reshape(-1, 2)[inliers] ** 2))),
         residual_sigmas=spread,
         speed_mean=float(speed[inliers].mean()),
         speed_std=float(speed[inliers].std()),

@@ -12,9 +12,11 @@ from ofsat_ros.optical_flow import (
     FlowInput,
     SparseLucasKanade,
     flow_engine,
+    sparse,
 )
 from ofsat_ros.parameters import Parameters
 from ofsat_ros.pipeline import Pipeline
+from ofsat_ros.pixels import Regions
 
 # A star of PSF sigma 1 px after the smoothing by 1 px.
 WIDTH = np.sqrt(2)
@@ -35,9 +37,9 @@ def flow_input(smoothed, xy, noise=1.0, length=0.0, threshold=4.0, pedestal=0.0)
         )
     return FlowInput(
         smoothed=smoothed.astype(np.float32),
-        mask=mask,
+        above=np.flatnonzero(mask),
         pedestal=pedestal,
-        labels=labels,
+        regions=Regions.of_labels(labels),
         xy=xy,
         sigma=np.full_like(xy, 0.01),
         length=np.full(len(xy), float(length)),
@@ -346,8 +348,10 @@ def test_dense_native_targets_are_regions_of_the_map_of_speeds(monkeypatch):
     velocity[2, 2] = (0, -2)
     solved[25, 5] = False
     current = flow_input(np.full((30, 40), 9.0), [(11, 5), (30.5, 20.5)])
-    current.labels[:] = 0
-    current.labels[5, 10:13], current.labels[20:22, 30:32], current.mask[10, 20] = 1, 2, 0
+    labels = np.zeros((30, 40), np.int32)
+    labels[5, 10:13], labels[20:22, 30:32] = 1, 2
+    above = np.setdiff1d(current.above, [10 * 40 + 20])
+    current = dataclasses.replace(current, above=above, regions=Regions.of_labels(labels))
     engine = DenseLucasKanade(Parameters.preset("paper_matlab"))
     monkeypatch.setattr(engine, "velocity_map", lambda *_: (velocity, solved))
     flow = engine.measure(current, current, STILL)
@@ -367,8 +371,9 @@ def test_dense_object_targets_take_the_median_of_each_objects_pixels(monkeypatch
     velocity = np.zeros((30, 40, 2), np.float32)
     solved = np.zeros((30, 40), bool)
     inputs = flow_input(np.full((30, 40), 9.0), [(10, 5), (30, 20)])
-    inputs.labels[:] = 0
-    inputs.labels[5, 8:13], inputs.labels[20, 29:32] = 1, 2
+    labels = np.zeros((30, 40), np.int32)
+    labels[5, 8:13], labels[20, 29:32] = 1, 2
+    inputs = dataclasses.replace(inputs, regions=Regions.of_labels(labels))
     velocity[5, 8:12] = (1, 0), (2, 0), (3, 4), (99, 0)
     solved[5, 8:11] = True
     engine = DenseLucasKanade(Parameters.preset("robust", engine="dense"))
@@ -420,13 +425,87 @@ def test_each_object_takes_the_guess_that_fits_it(engine):
     rso = np.array([100.3, 8.6])
     images = [blobs(SHAPE, [*xy, rso], 300, WIDTH) for xy in (stars, stars + shift)]
     inputs = [flow_input(images[0], [*stars, rso]), flow_input(images[1], [*(stars + shift), rso])]
-    flow = measure(inputs, [shift, (0, 0)], engine=engine)
+    flow = measure(inputs, [shift, (0, 0)], engine=engine, rso_test="vector")
     inside = in_both_frames(flow.position[:-1], shift, 6)
     assert flow.valid[:-1][inside].all()
     assert flow.valid[-1]
     # 24 grey levels make a star of 24 sigmas: rounding moves it by a little more than a bright one
     assert np.abs(flow.displacement[-1]).max() < 0.05
     assert np.abs(flow.displacement[:-1] - shift)[inside].max() < 0.05
+
+
+# --- tiles around objects instead of whole images ---------------------------------------------
+
+
+def sizes_given_to_opencv(monkeypatch):
+    """Record the pixels of the images that OpenCV follows points through."""
+    sizes, follow = [], sparse.cv2.calcOpticalFlowPyrLK
+
+    def recorded(start, *rest, **options):
+        sizes.append(start.size)
+        return follow(start, *rest, **options)
+
+    monkeypatch.setattr(sparse.cv2, "calcOpticalFlowPyrLK", recorded)
+    return sizes
+
+
+@pytest.mark.parametrize("length", [0, 5, 10])
+def test_tiles_give_what_whole_images_give(monkeypatch, length):
+    """In noise, with a guess that is 1.5 px off, away from the border."""
+    direction, shift = np.array([0.8, 0.6]), np.array([7.4, -3.7])
+    rng = np.random.default_rng(length)
+    inputs = star_inputs(shift, flux=500.0 + 60 * length, streak=length * direction, spacing=40)
+    noisy = [
+        dataclasses.replace(f, smoothed=f.smoothed + rng.normal(0, 1, SHAPE).astype(np.float32))
+        for f in inputs
+    ]
+    sizes = sizes_given_to_opencv(monkeypatch)
+    tiles = measure(noisy, [(8.5, -4.7)])
+    monkeypatch.setattr(sparse, "_ROOM_PX", max(SHAPE))
+    whole = measure(noisy, [(8.5, -4.7)])
+    assert sizes[0] < SHAPE[0] * SHAPE[1] == sizes[1]
+    np.testing.assert_array_equal(tiles.valid, whole.valid)
+    inside = in_both_frames(tiles.position, shift, 10 + length) & tiles.valid
+    assert inside.sum() >= 4
+    # OpenCV's points are float32: 1e-5 px at 200 px, and the iteration may end a step sooner
+    np.testing.assert_allclose(tiles.displacement[inside], whole.displacement[inside], atol=0.01)
+
+
+@pytest.mark.parametrize("shift", [(0.4, 0.0), (0.0, -0.6), (0.5, 0.5), (6.3, 0.2)])
+def test_objects_at_the_border_are_measured_as_others(shift):
+    """Their windows reach over the border, their light does hardly."""
+    places = np.array([[4.2, 80.3], [195.4, 40.6], [90.8, 4.4], [60.1, 155.3], [100.4, 80.2]])
+    inputs = [flow_input(blobs(SHAPE, xy, 300, WIDTH), xy) for xy in (places - shift, places)]
+    flow = measure(inputs, np.rint([shift]))
+    seen = in_both_frames(flow.position, shift, 3)
+    assert seen.sum() >= 3
+    assert flow.valid[seen].all()
+    assert np.abs(flow.displacement - shift)[seen].max() < 0.05
+
+
+def test_the_work_depends_on_the_objects_not_on_the_pixels(monkeypatch):
+    sizes = sizes_given_to_opencv(monkeypatch)
+    for side in (400, 800):
+        xy = np.array([[100.2, 50.4], [200.6, 120.3], [300.1, 350.7]])
+        inputs = [flow_input(blobs((side, side), xy + d, 300, WIDTH), xy + d) for d in (0, 0.4)]
+        assert measure(inputs).valid.all()
+    assert len(sizes) == 2
+    assert sizes[0] == sizes[1] < 4 * 30**2
+
+
+def test_guesses_are_tried_until_one_is_the_fields(monkeypatch):
+    inputs = star_inputs((0.4, -0.3))
+    sizes = sizes_given_to_opencv(monkeypatch)
+    flow = measure(inputs, [(60, 20), (0, 0)])
+    assert flow.valid.all()
+    # the wrong one alone, then each
+    assert len(sizes) == 3
+    # another star may stand where the wrong guess points
+    right = np.abs(flow.displacement - (0.4, -0.3)).max(axis=1) < 0.03
+    assert right.mean() > 0.9
+    # the first guess is the field's: the second is not tried
+    measure(inputs, [(0, 0), (60, 20)])
+    assert len(sizes) == 4
 
 
 # --- shapes, empties, interface ---------------------------------------------------------------
@@ -510,8 +589,12 @@ def test_a_satellite_faster_than_the_window_is_found_with_the_pyramid():
     keep = np.hypot(*(stars - rso).T) > 40
     before, now = np.vstack([stars[keep], rso - step]), np.vstack([stars[keep], rso])
     inputs = [flow_input(blobs(SHAPE, xy, 1500.0, WIDTH), xy) for xy in (before, now)]
-    flow = measure(inputs)
+    flow = measure(inputs, rso_test="vector")
     assert flow.valid[-1]
     # The pyramid ends at the full image: as sharp as any other.
     np.testing.assert_allclose(flow.displacement[-1], step, atol=0.1)
-    assert not measure(inputs, pyramid_levels=0).valid[-1]
+    assert not measure(inputs, rso_test="vector", pyramid_levels=0).valid[-1]
+    # Tests of more frames find it without its vector, and the stars' are there without pyramid.
+    field_only = measure(inputs)
+    assert field_only.valid[:-1].all()
+    assert not field_only.valid[-1]

@@ -54,6 +54,16 @@ def test_exact_vectors_give_the_exact_motion():
     assert motion.displacement_at(points) == pytest.approx(field_at(points), abs=1e-8)
 
 
+def test_a_large_image_is_as_exact():
+    shape = (8192, 8192)
+    xy = np.random.default_rng(10).uniform(0, 8192, (3000, 2))
+    displacement = field_at(xy + CENTRE - 4095.5)
+    speed = np.hypot(*displacement.T)
+    motion = estimate_motion(xy, displacement, np.full((3000, 2), 0.1), speed, shape)
+    assert values_of(motion)[:2] == pytest.approx(TRUTH[:2], abs=1e-8)
+    assert values_of(motion)[2:] == pytest.approx(TRUTH[2:], abs=1e-11)
+
+
 def test_outliers_do_not_move_the_fit():
     rng = np.random.default_rng(2)
     xy, displacement, sigma = vectors(rng, 100)
@@ -165,8 +175,10 @@ def test_vectors_at_one_place_do_not_break_the_fit():
     """Rotation and scale cannot be known; the shift there can."""
     rng = np.random.default_rng(8)
     displacement = (2, 1) + rng.normal(0, 0.05, (20, 2))
-    motion = estimate(np.tile(CENTRE, (20, 1)), displacement, np.full((20, 2), 0.05))
-    assert motion.displacement == pytest.approx((2, 1), abs=0.05)
+    for place in (CENTRE, CENTRE + (180, -120)):
+        motion = estimate(np.tile(place, (20, 1)), displacement, np.full((20, 2), 0.05))
+        assert motion.displacement_at(place[None])[0] == pytest.approx((2, 1), abs=0.05)
+        assert np.isfinite(motion.covariance).all()
 
 
 # --- the published mean -----------------------------------------------------------------------
