@@ -1,12 +1,14 @@
 """Linking: paths among spots, and how many of them chance gives."""
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 from sky import Path, frame_of, noise_spots, spots_at
 
-from ofsat_ros.tracking import Link, Sighting, find_links
+from ofsat_ros.tracking import Link, Sighting, find_links, linking
+from ofsat_ros.tracking.sightings import Vicinity
 
 SIDE = 256
 LIMIT = math.log(1e-3)
@@ -97,6 +99,114 @@ def test_the_longer_and_brighter_the_surer():
     assert by_frames == sorted(by_frames, reverse=True)
     by_excess = [links(mover(path, 5, excess), 0.0)[0].log_false for excess in (4, 5, 6, 8)]
     assert by_excess == sorted(by_excess, reverse=True)
+
+
+def all_pairs(
+    newest: Sighting, earlier: list[Sighting], max_speed_px: float
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return every pair that may start a path, whatever other frames show."""
+    pairs = []
+    for age, other in enumerate(earlier[:2], 1):
+        near = np.abs(newest.places[:, None] - other.places) <= age * max_speed_px
+        ratio = newest.excess[:, None] / other.excess
+        near &= (ratio < 5) & (ratio > 1 / 5)
+        near &= (newest.free & newest.telling)[:, None] & other.free & other.telling
+        pairs.append(np.nonzero(near))
+    return pairs
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("frames", [3, 4, 7])
+def test_no_path_is_lost_for_speed(seed: int, frames: int, monkeypatch: pytest.MonkeyPatch):
+    """Of streaks and points, some taken, under a sky that turns, in frames at uneven times."""
+    rng = np.random.default_rng(seed)
+    seen: list[Sighting] = []
+    stamps = np.cumsum(rng.choice([1.0, 1.0, 1.7, 4.0], frames))
+    starts, steps = rng.uniform(30, 220, (3, 2)), rng.uniform(-9, 9, (3, 2))
+    for number, time_s in enumerate(stamps):
+        turn = 0.01 * number
+        to_sky = np.array([[np.cos(turn), -np.sin(turn), 3 * number], [0, 0, 0], [0, 0, 1]])
+        to_sky[1] = -to_sky[0, 1], to_sky[0, 0], -number
+        frame = dataclasses.replace(frame_of(number, SIDE, to_sky), stamp_ns=int(time_s * 1e9))
+        moving = spots_at(frame.pixels(starts + time_s * steps) + rng.normal(0, 0.3, (3, 2)), 5)
+        spots = np.concatenate([noise_spots(rng, SIDE), moving])
+        streaks = rng.uniform(size=len(spots)) < 0.3
+        spots["length"] = np.where(streaks, rng.exponential(8, len(spots)), 0)
+        seen.append(Sighting.of(frame, spots, seen[-1] if seen else None))
+        seen[-1].free[rng.uniform(size=len(spots)) < 0.1] = False
+        seen[-1].telling[rng.uniform(size=len(spots)) < 0.1] = False
+    quick = find_links(seen, 5.0, 60.0)
+    monkeypatch.setattr(linking, "_pairs", all_pairs)
+    assert quick == find_links(seen, 5.0, 60.0)
+    assert quick or frames == 3
+
+
+def test_paths_are_found_among_thousands_of_spots():
+    """A frame of 2750 px on a side: 8,000 spots of noise, and twelve RSOs of all speeds."""
+    rng, side = np.random.default_rng(11), 2750
+    starts, steps = rng.uniform(1100, 1700, (12, 2)), rng.uniform(-90, 90, (12, 2))
+    seen: list[Sighting] = []
+    for number in range(7):
+        noise = noise_spots(rng, side)
+        moving = spots_at(starts + number * steps + rng.normal(0, 0.1, (12, 2)), 7)
+        spots = np.concatenate([moving, noise])
+        seen.append(Sighting.of(frame_of(number, side), spots, seen[-1] if seen else None))
+    assert len(noise) > 7500
+    found = find_links(seen, LIMIT, FASTEST_PX)
+    assert [len(set(link.rows.values())) for link in found] == [1] * 12
+    assert {link.rows[6] for link in found} == set(range(12))
+    assert all(len(link.rows) == 7 for link in found)
+
+
+@pytest.mark.parametrize("corner", [0, -30_000 + 20_000j])
+@pytest.mark.parametrize("asked_count", [300, 20])
+def test_all_spots_that_are_near_are_found(asked_count: int, corner: complex):
+    """Of many places by an index, of few by looking at all."""
+    rng = np.random.default_rng(12)
+    places = corner + rng.uniform(-300, 900, 400) + 1j * rng.uniform(50, 500, 400)
+    count = asked_count
+    asked = corner + rng.uniform(-500, 1100, count) + 1j * rng.uniform(-150, 700, count)
+    reach = rng.choice([0.3, 5.0, 8.0, 60.0, 2000.0], count)
+    spots = spots_at(np.stack([places.real, places.imag], axis=1), 5)
+    sighting = Sighting.of(frame_of(0), spots)
+    found = np.zeros((count, 400), int)
+    distance = np.abs(asked[:, None] - places)
+    for i, row, far in sighting.near(asked, reach):
+        np.add.at(found, (i, row), 1)
+        np.testing.assert_allclose(far, distance[i, row])
+    assert (found[distance <= reach[:, None]] == 1).all()
+    assert found.max() == 1
+    # And few others: what shares a cell of 50 px with a circle of 60 px is within 131 px.
+    assert (distance[(reach == 60)[:, None] & (found > 0)] < 131).all()
+    amid = distance.min(axis=1) < 30
+    assert (distance[(amid & (reach <= 8))[:, None] & (found > 0)] < 64).all()
+    empty = Sighting.of(frame_of(0), spots[:0])
+    assert sum(len(i) for i, *_ in empty.near(asked, reach)) == 0
+
+
+def test_the_map_knows_what_is_near():
+    rng = np.random.default_rng(13)
+    places = rng.uniform(-300, 900, 300) + 1j * rng.uniform(50, 500, 300)
+    asked = (
+        places[rng.integers(0, 300, 5000)] + rng.normal(0, 5, 5000) + 1j * rng.normal(0, 5, 5000)
+    )
+    distance = np.abs(asked[:, None] - places).min(axis=1)
+    vicinity = Vicinity(places, np.zeros(300, bool))
+    for reach in (1.0, 3.0, 7.0, 30.0):
+        near = np.zeros(5000, bool)
+        near[vicinity.within(asked, np.full(5000, reach))] = True
+        assert near[distance <= reach].all()
+        # Cells are 2 px wide: nothing farther than a cell and a half along both axes.
+        assert reach > 7 or (distance[near] < np.sqrt(2) * (reach + 4)).all()
+    # As a sum of two ways.
+    part = rng.uniform(-500, 500, 5000) + 1j * rng.uniform(-500, 500, 5000)
+    near = np.zeros(5000, bool)
+    near[vicinity.near(vicinity.cells(part) + vicinity.steps(asked - part))] = True
+    assert near[distance <= Vicinity.reach_px].all()
+    assert not near[distance > 13].any()
+    # Wherever it is, it may be near.
+    anywhere = np.array([Vicinity.anywhere, 2 * Vicinity.anywhere])
+    assert vicinity.near(anywhere + vicinity.cells(asked[:2])).tolist() == [0, 1]
 
 
 # What is not

@@ -1,5 +1,6 @@
 """Tracks: the filter, their ids, their ends, and what is said of them."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -8,8 +9,9 @@ import pytest
 from blobs import blobs, camera, flux_of_snr, scattered
 from sky import SECOND_NS, Path, frame_of, noise_spots, spots_at
 
-from ofsat_ros.detection import CANDIDATE, CONFIRMED, DETECTION_DTYPE
+from ofsat_ros.detection import CANDIDATE, CONFIRMED, DETECTION_DTYPE, Drift
 from ofsat_ros.history import History, PastFrame
+from ofsat_ros.objects import OBJECT_DTYPE
 from ofsat_ros.parameters import Parameters
 from ofsat_ros.pipeline import Pipeline
 from ofsat_ros.tracking import (
@@ -22,7 +24,7 @@ from ofsat_ros.tracking import (
     find_links,
 )
 from ofsat_ros.tracking import track as filter_of_tracks
-from ofsat_ros.tracking.track import Hit, Track
+from ofsat_ros.tracking.track import Hit, Track, add_hits, predict
 
 SIDE = 256
 NONE = spots_at([], 5)
@@ -46,9 +48,10 @@ class Night:
 
     def __init__(self, length: int = 9, coast_frames: int = 5, log_limit: float = LIMIT) -> None:
         self.history = History(length)
-        self.tracker = Tracker(self._look, lambda frame, others, spot, motion: spot)
+        self.tracker = Tracker(self._look, lambda frame, others, spots, motions, hidden: spots)
         self.coast_frames, self.log_limit = coast_frames, log_limit
         self.hidden: dict[int, np.ndarray] = {}
+        self.known: list[int] = []
         self.settled: list[Settled] = []
         self.count = 0
 
@@ -56,13 +59,30 @@ class Night:
         spots = self.hidden.get(frame.number, NONE)
         return spots[np.hypot(*(place(spots) - xy).T) < 2][:1]
 
+    def _drifts(self, known: np.ndarray) -> list[Drift]:
+        self.known = known.tolist()
+        return []
+
     def see(
-        self, spots: np.ndarray, to_sky: np.ndarray | None = None, defects: int = 0
+        self,
+        spots: np.ndarray,
+        to_sky: np.ndarray | None = None,
+        defects: int = 0,
+        objects: np.ndarray | None = None,
     ) -> Tracked:
-        self.history.add(frame_of(self.count, SIDE, to_sky))
+        frame = frame_of(self.count, SIDE, to_sky)
+        if objects is not None:
+            frame = dataclasses.replace(frame, objects=objects)
+        self.history.add(frame)
         self.count += 1
         tracked = self.tracker.update(
-            self.history, [spots], [], defects, self.log_limit, 150.0, self.coast_frames
+            self.history,
+            [spots],
+            self._drifts,
+            defects,
+            self.log_limit,
+            150.0,
+            self.coast_frames,
         )
         self.settled += tracked.settled
         return tracked
@@ -111,7 +131,7 @@ def test_without_manoeuvres_the_filter_is_a_least_squares_line(monkeypatch: pyte
     np.testing.assert_allclose(track.state, expected.ravel(), atol=1e-4)
     np.testing.assert_allclose(track.covariance, np.kron(covariance, np.eye(2)), atol=1e-6)
     # And where it will be.
-    state, spread = track.predict(10 * SECOND_NS)
+    ((state,), (spread,)) = predict([track], 10 * SECOND_NS)
     np.testing.assert_allclose(state[:2], expected[0] + 3 * expected[1], atol=1e-4)
     at_ten = np.array([1.0, 3.0])
     np.testing.assert_allclose(spread[0, 0], at_ten @ covariance @ at_ten, rtol=1e-4)
@@ -124,7 +144,7 @@ def test_adding_hits_is_fitting_them_all():
     grown = Track(-50.0, 1.0, {k: hits[k] for k in range(3)})
     grown.fit()
     for k in range(3, 8):
-        grown.add(hits[k])
+        add_hits([grown], [hits[k]])
     np.testing.assert_allclose(grown.state, whole.state)
     np.testing.assert_allclose(grown.covariance, whole.covariance)
     assert (grown.hit_count, grown.born_ns) == (whole.hit_count, whole.born_ns) == (8, 0)
@@ -148,7 +168,7 @@ def test_the_covariance_is_honest(ahead_s: int):
         hits = hits_along(path, 0.15, random, range(10))
         track = Track(-50.0, 1.0, hits)
         track.fit()
-        state, covariance = track.predict((9 + ahead_s) * SECOND_NS)
+        ((state,), (covariance,)) = predict([track], (9 + ahead_s) * SECOND_NS)
         at = 20 * (9 + ahead_s)
         off = np.concatenate([places[at], rates[at]]) - state
         errors.append(off @ np.linalg.solve(covariance, off))
@@ -157,6 +177,18 @@ def test_the_covariance_is_honest(ahead_s: int):
     assert np.mean(errors) == pytest.approx(4, abs=0.42 + 0.2)
     # Of a chi^2 of 4, 5 % lie above 9.49: 20 +- 4.4.
     assert 7 <= np.count_nonzero(np.array(errors) > 9.49) <= 36
+
+
+def test_spots_together_have_the_covariances_that_each_has():
+    spots = spots_at(np.ones((5, 2)), [5, 10, 20, 40, 80])
+    spots["length"], spots["angle"] = [0, 4, 20, 20, 9], [0, 1, -1, 0.3, 1.5]
+    spots["refined"][::2] = True
+    turned = np.array([[0.8, -0.6, 5], [0.6, 0.8, 7], [0, 0, 1]])
+    frame = frame_of(0, SIDE, turned)
+    together = filter_of_tracks.covariances(frame, spots)
+    for spot, covariance in zip(spots, together, strict=True):
+        np.testing.assert_allclose(Hit.of(frame, spot).covariance, covariance, rtol=1e-12)
+    assert filter_of_tracks.covariances(frame, spots[:0]).shape == (0, 2, 2)
 
 
 def test_a_streak_is_less_sure_along_itself():
@@ -394,6 +426,26 @@ def test_what_stops_is_a_star_after_all():
     assert 6 + 5 <= ended <= 6 + 10
 
 
+def test_objects_that_tracks_took_are_known_to_the_search_for_drifts():
+    """A fast track takes the spot of an object; a slow one an object that is no spot."""
+    night, fast, slow = Night(), line((40, 60), (5, 3)), line((150, 150), (1.5, 1.0))
+    for k in range(8):
+        spots = spots_at([fast(k), slow(k)], 20)
+        objects = np.zeros(4, OBJECT_DTYPE)
+        for row, source in ((1, spots[0]), (3, spots[1])):
+            for name in ("x", "y", "sigma_x", "sigma_y", "snr", "flux"):
+                objects[row][name] = source[name]
+        # The others are stars, far away.
+        objects["x"][[0, 2]], objects["flux"][[0, 2]] = (20, 230), 2000
+        spots["object_index"] = 1, 3
+        tracked = night.see(spots if k < 5 else spots[:1], objects=objects)
+        assert sorted(night.known) == ([] if k < 3 else [1, 3])
+    assert tracked.tracks["status"].tolist() == [CONFIRMED] * 2
+    # What was taken as an object, not as a spot, is where the object is.
+    (row,) = tracked.detections[tracked.detections["object_index"] == 3]
+    np.testing.assert_allclose(place(row), slow(7))
+
+
 @pytest.mark.parametrize("angle", [25.0, 60.0, 90.0, 150.0])
 def test_rsos_that_cross_keep_their_ids(angle: float):
     """They meet in one place at one time, where only one spot is seen."""
@@ -471,9 +523,11 @@ def test_an_rso_that_passes_over_a_star_keeps_its_id():
         settled += result.settled
         if k >= 2:
             assert result.tracks["track_id"].tolist() == [1], k
-            # Within 3 px of the star it may be hidden; its place is still known.
+            # Within 3 px of the star it may be hidden, or only the side away from it be seen, and
+            # noise decides how far that pulls (0.26 px rms over 16 skies); its place is known.
             hidden = abs(k - 7) <= 1
-            np.testing.assert_allclose(place(result.tracks)[0], path(k), atol=0.5)
+            near = 1.0 if hidden else 0.5
+            np.testing.assert_allclose(place(result.tracks)[0], path(k), atol=near)
             assert hidden or result.tracks["status"].tolist() == [CONFIRMED], k
     settled += pipeline.finish()
     for one in settled:

@@ -5,8 +5,9 @@ an RSO: what lies on a path that chance does not explain.  Tracks keep their ids
 gaps, and end.
 """
 
-from ofsat_ros.tracking.linking import Link, Sighting, find_links
+from ofsat_ros.tracking.linking import Link, find_links
 from ofsat_ros.tracking.rows import COASTING, TRACK_DTYPE, Settled
+from ofsat_ros.tracking.sightings import Sighting
 from ofsat_ros.tracking.tracker import Tracked, Tracker
 
 __all__ = [

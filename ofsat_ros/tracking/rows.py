@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ofsat_ros.detection import CONFIRMED, DETECTION_DTYPE
+from ofsat_ros.detection import CONFIRMED, DETECTION_DTYPE, SPOT_DTYPE
 from ofsat_ros.history import History, PastFrame
-from ofsat_ros.tracking.track import Hit, Track
+from ofsat_ros.tracking.track import Track, predict
 
 Array = NDArray[np.float64]
 
@@ -64,72 +65,91 @@ class Settled:
     detections: NDArray[np.void]
 
 
-def settled_row(track: Track, hit: Hit, history: History) -> np.void:
-    """Return `detection_row` with the velocity that hits before and after it show."""
-    state = np.array([*hit.sky, *track.velocity_near(hit.number)])
-    return _row(track, hit, state, history, CONFIRMED)
+def settled_rows(tracks: Sequence[Track], frame: PastFrame, history: History) -> NDArray[np.void]:
+    """Return what tracks' hits say of a frame, (K,) DETECTION_DTYPE, in their order.
+
+    With the velocities that the hits before and after them show.
+    """
+    hits = [track.hits[frame.number] for track in tracks]
+    velocities = [track.velocity_near(frame.number) for track in tracks]
+    states = [[*hit.sky, *rate] for hit, rate in zip(hits, velocities, strict=True)]
+    return _rows(tracks, np.array(states), CONFIRMED, frame, history)
 
 
-def detection_row(track: Track, hit: Hit, history: History, status: int) -> np.void:
-    """Return what a track's hit says of its frame, as one DETECTION_DTYPE."""
-    return _row(track, hit, track.predict(hit.stamp_ns)[0], history, status)
-
-
-def _row(track: Track, hit: Hit, state: Array, history: History, status: int) -> np.void:
-    frame = _frame(history, hit.number)
-    row = np.zeros(1, DETECTION_DTYPE)[0]
-    for name in ("x", "y", "sigma_x", "sigma_y", "snr", "flux", "length", "angle"):
-        row[name] = hit.spot[name]
-    row["vx"], row["vy"] = _image_velocity(state, frame, history)
-    row["rel_vx"], row["rel_vy"] = _turned(frame, state[2:])
-    row["ra"] = row["dec"] = np.nan
-    row["significance"] = hit.spot["excess"]
-    row["track_id"], row["status"] = track.track_id, status
-    row["object_index"], row["flow_index"] = hit.spot["object_index"], -1
-    return row
-
-
-def track_row(track: Track, history: History) -> np.void:
-    """Return a track's state in the newest frame, as one TRACK_DTYPE."""
+def detection_rows(tracks: Sequence[Track], status: int, history: History) -> NDArray[np.void]:
+    """Return what tracks' hits say of the newest frame, (K,) DETECTION_DTYPE, in their order."""
     frame = history[-1]
-    state, covariance = track.predict(frame.stamp_ns)
-    row = np.zeros(1, TRACK_DTYPE)[0]
-    row["x"], row["y"] = frame.pixels(state[None, :2])[0]
-    row["vx"], row["vy"] = _image_velocity(state, frame, history)
-    row["rel_vx"], row["rel_vy"] = _turned(frame, state[2:])
+    return _rows(tracks, predict(tracks, frame.stamp_ns)[0], status, frame, history)
+
+
+def _rows(
+    tracks: Sequence[Track], states: Array, status: int, frame: PastFrame, history: History
+) -> NDArray[np.void]:
+    rows = np.zeros(len(tracks), DETECTION_DTYPE)
+    if not tracks:
+        return rows
+    spots = np.array([track.hits[frame.number].spot for track in tracks], SPOT_DTYPE)
+    for name in ("x", "y", "sigma_x", "sigma_y", "snr", "flux", "length", "angle"):
+        rows[name] = spots[name]
+    _set_velocities(rows, states, frame, history)
+    rows["ra"] = rows["dec"] = np.nan
+    rows["significance"] = spots["excess"]
+    rows["track_id"], rows["status"] = [track.track_id for track in tracks], status
+    rows["object_index"], rows["flow_index"] = spots["object_index"], -1
+    return rows
+
+
+def track_rows(tracks: Sequence[Track], history: History) -> NDArray[np.void]:
+    """Return tracks' states in the newest frame, (N,) TRACK_DTYPE, in their order."""
+    rows = np.zeros(len(tracks), TRACK_DTYPE)
+    if not tracks:
+        return rows
+    frame = history[-1]
+    states, covariances = predict(tracks, frame.stamp_ns)
+    rows["x"], rows["y"] = frame.pixels(states[:, :2]).T
+    _set_velocities(rows, states, frame, history)
     turn = frame.from_sky[:2, :2]
-    row["sigma_x"], row["sigma_y"] = np.sqrt(np.diag(turn @ covariance[:2, :2] @ turn.T))
-    row["sigma_vx"], row["sigma_vy"] = np.sqrt(np.diag(turn @ covariance[2:, 2:] @ turn.T))
+    for names, part in (
+        (("sigma_x", "sigma_y"), slice(2)),
+        (("sigma_vx", "sigma_vy"), slice(2, 4)),
+    ):
+        spread = turn @ covariances[:, part, part] @ turn.T
+        for axis, name in enumerate(names):
+            rows[name] = np.sqrt(spread[:, axis, axis])
+    spots = np.array([track.last.spot for track in tracks], SPOT_DTYPE)
     for name in ("snr", "flux", "length", "angle"):
-        row[name] = track.last.spot[name]
-    row["ra"] = row["dec"] = np.nan
-    row["age"] = (frame.stamp_ns - track.born_ns) / 1e9
-    row["hits"], row["misses"] = track.hit_count, track.missed
-    row["log_false"], row["track_id"] = track.log_false, track.track_id
-    row["status"] = CONFIRMED if frame.number in track.hits else COASTING
-    return row
+        rows[name] = spots[name]
+    rows["ra"] = rows["dec"] = np.nan
+    rows["age"] = [(frame.stamp_ns - track.born_ns) / 1e9 for track in tracks]
+    rows["hits"] = [track.hit_count for track in tracks]
+    rows["misses"] = [track.missed for track in tracks]
+    rows["log_false"] = [track.log_false for track in tracks]
+    rows["track_id"] = [track.track_id for track in tracks]
+    seen = [frame.number in track.hits for track in tracks]
+    rows["status"] = np.where(seen, CONFIRMED, COASTING)
+    return rows
 
 
-def _frame(history: History, number: int) -> PastFrame:
-    return history[number - history[0].number]
+def _set_velocities(
+    rows: NDArray[np.void], states: Array, frame: PastFrame, history: History
+) -> None:
+    """Set the velocities in the image and against the star field, of states (N, 4)."""
+    rows["vx"], rows["vy"] = _image_velocities(states, frame, history).T
+    rows["rel_vx"], rows["rel_vy"] = frame.from_sky[:2, :2] @ states[:, 2:].T
 
 
-def _image_velocity(state: Array, frame: PastFrame, history: History) -> Array:
-    """Velocity in the image, px/s: the RSO's own and the field's.
+def _image_velocities(states: Array, frame: PastFrame, history: History) -> Array:
+    """Velocities in the image, (N, 2) px/s: the RSOs' own and the field's.
 
-    Of the line through its places in the frames around: a mount that jitters moves the image from
-    frame to frame, but goes nowhere.
+    Of the lines through their places in the frames around: a mount that jitters moves the image
+    from frame to frame, but goes nowhere.
     """
     near = sorted(history, key=lambda other: abs(other.number - frame.number))[:_FIT_FRAMES]
     t = np.array([(other.stamp_ns - frame.stamp_ns) / 1e9 for other in near])
-    places = np.array(
-        [
-            other.pixels((state[:2] + state[2:] * seconds)[None])[0]
-            for other, seconds in zip(near, t, strict=True)
-        ]
-    )
-    return np.polynomial.polynomial.polyfit(t - t.mean(), places, 1)[1]
-
-
-def _turned(frame: PastFrame, velocity: Array) -> Array:
-    return frame.from_sky[:2, :2] @ velocity
+    off = t - t.mean()
+    # The fit is linear in the places, and these are in the states.
+    matrices = np.array([other.from_sky[:2] for other in near])
+    share = off / (off @ off)
+    of_place = np.tensordot(share, matrices, 1)
+    of_rate = np.tensordot(share * t, matrices[:, :, :2], 1)
+    return states[:, :2] @ of_place[:, :2].T + of_place[:, 2] + states[:, 2:] @ of_rate.T

@@ -1,8 +1,16 @@
-"""One track: the hits of an RSO and a constant-velocity Kalman filter in the sky plane."""
+"""Tracks: the hits of an RSO and a constant-velocity Kalman filter in the sky plane.
+
+The filter works on all tracks at once: a matrix of one track costs as much as those of a hundred.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
+from operator import mul
+from statistics import median
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +33,11 @@ _LEAST_WAY_PX, _WAY_SIGMAS = 1.0, 4.0
 _MISS_LOG = 1.5
 # Nothing is known of the velocity before the second hit, px per frame.
 _ANY_SPEED_PX = 1000.0
+# Which elements of a (4, 4) matrix are of the place, of the place and the rate, of the rate.
+_PLACE, _BOTH, _RATE = (
+    np.kron(block, np.eye(2)) for block in ([[1, 0], [0, 0]], [[0, 1], [1, 0]], [[0, 0], [0, 1]])
+)
+_STEP = np.triu(_BOTH)
 
 
 @dataclass(frozen=True)
@@ -52,18 +65,37 @@ class Hit:
     @classmethod
     def of(cls, frame: PastFrame, spot: np.void) -> Hit:
         """Build from a spot of a frame."""
-        sky = frame.sky(np.array([[spot["x"], spot["y"]]]))[0]
-        along = np.array([np.cos(spot["angle"]), np.sin(spot["angle"])])
-        along *= (_REFINED_SPREAD if spot["refined"] else _STREAK_SPREAD) * spot["length"]
-        own = np.diag([spot["sigma_x"] ** 2, spot["sigma_y"] ** 2])
-        own = own + np.outer(along, along) + _FLOOR_PX**2 * np.eye(2)
-        turn = frame.to_sky[:2, :2]
-        return cls(frame.number, frame.stamp_ns, spot, sky, turn @ own @ turn.T)
+        (hit,) = cls.of_all(frame, np.array([spot], spot.dtype))
+        return hit
+
+    @classmethod
+    def of_all(cls, frame: PastFrame, spots: NDArray[np.void]) -> list[Hit]:
+        """Build from spots (N,) of a frame."""
+        sky = frame.sky(np.stack([spots["x"], spots["y"]], axis=1))
+        parts = zip(spots, sky, covariances(frame, spots), strict=True)
+        return [cls(frame.number, frame.stamp_ns, *part) for part in parts]
+
+    @cached_property
+    def weight(self) -> float:
+        """One over the variance of its place, px^-2."""
+        return 1 / float(self.covariance[0, 0] + self.covariance[1, 1])
 
     @property
     def xy(self) -> Array:
         """Its place in the image, px."""
         return np.array([self.spot["x"], self.spot["y"]])
+
+
+def covariances(frame: PastFrame, spots: NDArray[np.void]) -> Array:
+    """Covariances of the places of spots (N,) of a frame in the sky plane, (N, 2, 2) px^2."""
+    along = np.where(spots["refined"], _REFINED_SPREAD, _STREAK_SPREAD) * spots["length"]
+    along_x, along_y = along * np.cos(spots["angle"]), along * np.sin(spots["angle"])
+    own = np.empty((len(along), 2, 2))
+    own[:, 0, 0] = spots["sigma_x"] ** 2 + along_x**2 + _FLOOR_PX**2
+    own[:, 1, 1] = spots["sigma_y"] ** 2 + along_y**2 + _FLOOR_PX**2
+    own[:, 0, 1] = own[:, 1, 0] = along_x * along_y
+    turn = frame.to_sky[:2, :2]
+    return turn @ own @ turn.T
 
 
 @dataclass
@@ -121,32 +153,7 @@ class Track:
         self.covariance[:2, :2] = first.covariance
         self.stamp_ns = first.stamp_ns
         for hit in hits[1:]:
-            self._update(hit)
-
-    def predict(self, stamp_ns: int) -> tuple[Array, Array]:
-        """State and covariance at another time, (4,) and (4, 4)."""
-        dt = (stamp_ns - self.stamp_ns) / 1e9
-        step = np.eye(4)
-        step[0, 2] = step[1, 3] = dt
-        speed = np.hypot(*self.state[2:])
-        wander = (_WANDER_PX / self.frame_s + _MANOEUVRE * speed) ** 2 / self.frame_s
-        t = abs(dt)
-        noise = np.kron([[t**3 / 3, t * dt / 2], [t * dt / 2, t]], np.eye(2)) * wander
-        return step @ self.state, step @ self.covariance @ step.T + noise
-
-    def add(self, hit: Hit) -> None:
-        """Take the next hit, of a later frame than all others."""
-        self.hits[hit.number] = hit
-        self.hit_count += 1
-        self._update(hit)
-
-    def _update(self, hit: Hit) -> None:
-        state, covariance = self.predict(hit.stamp_ns)
-        gain = covariance[:, :2] @ np.linalg.inv(covariance[:2, :2] + hit.covariance)
-        self.state = state + gain @ (hit.sky - state[:2])
-        covariance = covariance - gain @ covariance[:2]
-        self.covariance = (covariance + covariance.T) / 2
-        self.stamp_ns = hit.stamp_ns
+            _update([self], [hit])
 
     def velocity_near(self, number: int) -> Array:
         """Velocity in the sky plane around a frame, (2,) px/s: of a line through the nearest hits.
@@ -163,7 +170,7 @@ class Track:
             return False
         velocity, error = self._line(last)
         span = (last[-1].stamp_ns - last[0].stamp_ns) / 1e9
-        way = float(np.hypot(*velocity)) * span
+        way = math.hypot(*velocity) * span
         return way < max(_LEAST_WAY_PX, _WAY_SIGMAS * error * span)
 
     def is_sustained(self, log_limit: float) -> bool:
@@ -172,25 +179,27 @@ class Track:
         balance = max(self.missed, self.misses) - later
         return self.log_false + _MISS_LOG * balance < log_limit
 
-    def _line(self, hits: list[Hit]) -> tuple[Array, float]:
+    def _line(self, hits: Sequence[Hit]) -> tuple[Array, float]:
         """Velocity of the line through hits, px/s, and its std."""
-        t = np.array([(hit.stamp_ns - hits[0].stamp_ns) / 1e9 for hit in hits])
-        weight = np.array([1 / np.trace(hit.covariance) for hit in hits])
-        off = t - np.average(t, weights=weight)
-        sky = np.array([hit.sky for hit in hits])
-        spread = float(np.sum(weight * off**2))
+        t = [(hit.stamp_ns - hits[0].stamp_ns) / 1e9 for hit in hits]
+        weight = [hit.weight for hit in hits]
+        mean = sum(map(mul, weight, t)) / sum(weight)
+        off = [w * (seconds - mean) for w, seconds in zip(weight, t, strict=True)]
+        spread = sum(map(mul, off, t))
         if spread <= 0:
-            return np.zeros(2), np.inf
-        return np.sum((weight * off)[:, None] * sky, axis=0) / spread, float(1 / np.sqrt(spread))
+            return np.zeros(2), math.inf
+        velocity = sum(part * hit.sky for part, hit in zip(off, hits, strict=True)) / spread
+        return velocity, 1 / math.sqrt(spread)
 
     def forget(self, before: int) -> None:
         """Drop the hits in frames of lower numbers; the state keeps what they taught."""
         kept = {number: hit for number, hit in self.hits.items() if number >= before}
         self.hits = kept or {max(self.hits): self.last}
 
-    def place(self, frame: PastFrame) -> Array:
-        """Where it is expected in a frame, px."""
-        return frame.pixels(self.predict(frame.stamp_ns)[0][None, :2])[0]
+    @property
+    def speed(self) -> float:
+        """Its speed in the sky plane, px/s."""
+        return math.hypot(self.state[2], self.state[3])
 
     @property
     def last(self) -> Hit:
@@ -200,9 +209,56 @@ class Track:
     @property
     def flux(self) -> float:
         """Median flux of the hits, DN."""
-        return float(np.median([hit.spot["flux"] for hit in self.hits.values()]))
+        return float(median(hit.spot["flux"] for hit in self.hits.values()))
 
     @property
     def length(self) -> float:
         """Median length of the hits' streaks, px."""
-        return float(np.median([hit.spot["length"] for hit in self.hits.values()]))
+        return float(median(hit.spot["length"] for hit in self.hits.values()))
+
+
+def predict(tracks: Sequence[Track], stamp_ns: int) -> tuple[Array, Array]:
+    """States and covariances of N tracks at another time, (N, 4) and (N, 4, 4)."""
+    if not tracks:
+        return np.zeros((0, 4)), np.zeros((0, 4, 4))
+    states = np.array([track.state for track in tracks])
+    covariances = np.array([track.covariance for track in tracks])
+    dt, frame_s = np.array(
+        [((stamp_ns - track.stamp_ns) / 1e9, track.frame_s) for track in tracks]
+    ).T[:, :, None, None]
+    speed = np.hypot(states[:, 2], states[:, 3])[:, None, None]
+    wander = np.abs(dt) * (_WANDER_PX / frame_s + _MANOEUVRE * speed) ** 2 / frame_s
+    step = np.eye(4) + dt * _STEP
+    noise = wander * ((dt**2 / 3) * _PLACE + (dt / 2) * _BOTH + _RATE)
+    states[:, :2] += dt[:, 0] * states[:, 2:]
+    return states, step @ covariances @ step.transpose(0, 2, 1) + noise
+
+
+def places(tracks: Sequence[Track], frame: PastFrame) -> Array:
+    """Where N tracks are expected in a frame, (N, 2) px."""
+    ahead = [(frame.stamp_ns - track.stamp_ns) / 1e9 for track in tracks]
+    states = np.array([track.state for track in tracks]).reshape(-1, 4)
+    return frame.pixels(states[:, :2] + np.array(ahead)[:, None] * states[:, 2:])
+
+
+def add_hits(tracks: Sequence[Track], hits: Sequence[Hit]) -> None:
+    """Give each track its next hit, all of one frame, later than all others."""
+    for track, hit in zip(tracks, hits, strict=True):
+        track.hits[hit.number] = hit
+        track.hit_count += 1
+    _update(tracks, hits)
+
+
+def _update(tracks: Sequence[Track], hits: Sequence[Hit]) -> None:
+    """Filter a hit of each track, all of one frame."""
+    if not tracks:
+        return
+    states, covariances = predict(tracks, hits[0].stamp_ns)
+    spread = covariances[:, :2, :2] + np.array([hit.covariance for hit in hits])
+    gain = covariances[:, :, :2] @ np.linalg.inv(spread)
+    off = np.array([hit.sky for hit in hits]) - states[:, :2]
+    states += (gain @ off[:, :, None])[:, :, 0]
+    covariances = covariances - gain @ covariances[:, :2]
+    covariances = (covariances + covariances.transpose(0, 2, 1)) / 2
+    for track, hit, state, covariance in zip(tracks, hits, states, covariances, strict=True):
+        track.state, track.covariance, track.stamp_ns = state, covariance, hit.stamp_ns

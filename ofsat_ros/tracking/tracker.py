@@ -7,6 +7,7 @@ what is left is searched for new tracks, and a new track labels what it was seen
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -16,16 +17,23 @@ from scipy.optimize import linear_sum_assignment
 
 from ofsat_ros.detection import BORDER_PX, CANDIDATE, CONFIRMED, DETECTION_DTYPE, SPOT_DTYPE, Drift
 from ofsat_ros.history import History, PastFrame
-from ofsat_ros.tracking.linking import Sighting, find_links
-from ofsat_ros.tracking.rows import TRACK_DTYPE, Settled, detection_row, settled_row, track_row
-from ofsat_ros.tracking.track import Hit, Track
+from ofsat_ros.tracking.linking import find_links
+from ofsat_ros.tracking.rows import TRACK_DTYPE, Settled, detection_rows, settled_rows, track_rows
+from ofsat_ros.tracking.sightings import Sighting, as_complex
+from ofsat_ros.tracking.track import Hit, Track, add_hits, covariances, places, predict
 
 Array = NDArray[np.float64]
 # Looks in a frame, compared with others, near a point: none or one SPOT_DTYPE.
 Look = Callable[[PastFrame, Sequence[PastFrame], Array], NDArray[np.void]]
 
-# Measures a spot of a frame again, compared with others, given its displacement per frame, px.
-Refine = Callable[[PastFrame, Sequence[PastFrame], np.void, Array], np.void]
+# Measures spots of a frame again, compared with others, given their displacements per frame, px,
+# and which of the others show them, too.
+Refine = Callable[
+    [PastFrame, Sequence[PastFrame], NDArray[np.void], Array, NDArray[np.bool_]], NDArray[np.void]
+]
+
+# Finds objects of the newest frame that drift, beside those of known rows.
+FindDrifts = Callable[[NDArray[np.intp]], Sequence[Drift]]
 
 # A spot this far from where a track is expected, in sigmas, is not its.
 _GATE_SIGMAS = 4.0
@@ -46,6 +54,8 @@ _SURE_PX = 1.5
 _FAINT_SIGMAS = 4.0
 # What is left of a star beside a spot may pull it by this, px.
 _PULLED_PX = 1.0
+# Farther from where it is expected, beyond half of what it moves in a frame, it is not sought, px.
+_FARTHEST_PX = 50.0
 # The distance of what cannot be.
 _NEVER = 1e6
 # A frame in which the track itself was as near as this doesn't show what is behind it, px.
@@ -85,7 +95,7 @@ class Tracker:
     look : callable
         Takes a closer look for a spot near a point of a frame.
     refine : callable
-        Measures a spot's place once more.
+        Measures the places of spots of one frame once more.
     """
 
     def __init__(self, look: Look, refine: Refine) -> None:
@@ -109,7 +119,7 @@ class Tracker:
         self,
         history: History,
         spots: Sequence[NDArray[np.void]],
-        drifts: Sequence[Drift],
+        find_drifts: FindDrifts,
         defects: int,
         log_limit: float,
         max_speed_px: float,
@@ -123,8 +133,9 @@ class Tracker:
             The frames, the current one last.
         spots : sequence of (N,) SPOT_DTYPE
             Spots of the newest frames that were not given before, the current one last.
-        drifts : sequence of Drift
-            Objects of the current frame that drift.
+        find_drifts : callable
+            Finds objects of the current frame that drift, beside those that tracks took, whose
+            rows it is given.
         defects : int
             Known defects of the sensor.
         log_limit : float
@@ -145,22 +156,21 @@ class Tracker:
         oldest = history[0].number
         self._sightings = [s for s in self._sightings if s.frame.number >= oldest]
         self._follow(history, log_limit, coast_frames)
+        drifts = find_drifts(self._known_objects(frame))
         born, candidates = self._new_tracks(history, drifts, defects, log_limit, max_speed_px)
         self._tracks += born
         now = [
-            detection_row(track, track.hits[frame.number], history, status)
+            detection_rows([t for t in tracks if frame.number in t.hits], status, history)
             for tracks, status in ((self._tracks, CONFIRMED), (candidates, CANDIDATE))
-            for track in tracks
-            if frame.number in track.hits
         ]
-        rows = [track_row(track, history) for track in self._tracks]
+        rows = track_rows(self._tracks, history)
         # The oldest frame makes room for the next one.
         full = len(history) == history.length
         settled = self.settle(history, 1) if full else []
         for track in self._tracks:
             track.forget(oldest - history.length)
         self._ended = [track for track in self._ended if max(track.hits) > oldest]
-        return Tracked(np.array(now, DETECTION_DTYPE), np.array(rows, TRACK_DTYPE), settled)
+        return Tracked(np.concatenate(now), rows, settled)
 
     def settle(self, history: History, count: int) -> list[Settled]:
         """Say the last word on the oldest frames, this many, that it was not said of before."""
@@ -169,55 +179,67 @@ class Tracker:
             if frame.number < self._next_to_settle:
                 continue
             self._next_to_settle = frame.number + 1
-            rows = [
-                settled_row(track, track.hits[frame.number], history)
-                for track in (*self._ended, *self._tracks)
-                if frame.number in track.hits
-            ]
-            detections = np.array(rows, DETECTION_DTYPE)
+            tracks = [t for t in (*self._ended, *self._tracks) if frame.number in t.hits]
+            detections = settled_rows(tracks, frame, history)
             settled.append(Settled(frame.number, frame.stamp_ns, detections))
         return settled
+
+    def _known_objects(self, frame: PastFrame) -> NDArray[np.intp]:
+        """Rows of the objects that tracks took in a frame."""
+        hits = [track.hits[frame.number] for track in self._tracks if frame.number in track.hits]
+        rows = np.array([hit.spot["object_index"] for hit in hits], np.intp)
+        return rows[rows >= 0]
 
     def _follow(self, history: History, log_limit: float, coast_frames: int) -> None:
         """Give each track its spot of the newest frame, and end those that are gone."""
         frame, sighting = history[-1], self._sightings[-1]
-        assigned = self._assign(frame, sighting)
-        taken = [hit.xy for hit in assigned.values()]
+        inside = frame.contains(places(self._tracks, frame))
+        rows, spots = self._assign(frame, sighting)
+        taken = list(np.stack([spots["x"], spots["y"]], axis=1))
+        sure = [self._tracks[row] for row in rows]
+        hits = self._refined(sure, frame, history, spots)
+        add_hits(sure, hits)
+        for track in sure:
+            track.misses = 0
+        for row in sorted(set(np.flatnonzero(inside)) - set(rows)):
+            # What only a closer look finds keeps the track where it is, but not alive.
+            track = self._tracks[row]
+            track.misses += 1
+            hit = self._closer_look(track, frame, history, taken)
+            if hit is None:
+                track.missed += 1
+            else:
+                add_hits([track], [hit])
+                hits.append(hit)
         kept = []
-        for row, track in enumerate(self._tracks):
-            hit = assigned.get(row)
-            gone = not frame.contains(track.place(frame)[None])[0]
-            if hit is not None:
-                track.misses = 0
-                hit = self._refined(track, frame, history, hit)
-            elif not gone:
-                # What only a closer look finds keeps the track where it is, but not alive.
-                track.misses += 1
-                hit = self._closer_look(track, frame, history, taken)
-                track.missed += hit is None
-            if hit is not None:
-                track.add(hit)
-                sighting.free &= ~_pieces(sighting.spots, hit)
-            if not gone and track.misses <= coast_frames and not track.stands_still():
+        for track, seen in zip(self._tracks, inside, strict=True):
+            if track.stands_still():
+                continue
+            if seen and track.misses <= coast_frames:
                 kept.append(track)
-            elif not track.stands_still() and track.is_sustained(log_limit):
+            elif track.is_sustained(log_limit):
                 self._ended.append(track)
+        _take(sighting, hits)
         self._tracks = kept
 
-    def _assign(self, frame: PastFrame, sighting: Sighting) -> dict[int, Hit]:
-        """The hit of each track, by its row, such that their distances are least in all."""
-        rest = np.setdiff1d(np.arange(len(frame.objects)), sighting.spots["object_index"])
-        pool = np.concatenate([sighting.spots, _as_spots(frame, rest)])
-        cost = np.full((len(self._tracks), len(pool)), _NEVER)
-        for row, track in enumerate(self._tracks):
-            cost[row] = _distances(track, frame, pool, len(sighting.spots))
+    def _assign(
+        self, frame: PastFrame, sighting: Sighting
+    ) -> tuple[NDArray[np.intp], NDArray[np.void]]:
+        """Rows of tracks, and the spot of each, such that their distances are least in all."""
+        if not self._tracks:
+            return np.zeros(0, np.intp), np.zeros(0, SPOT_DTYPE)
+        row, column, spots, distance = _candidates(self._tracks, frame, sighting)
         # What is beyond the gate must not weigh in what others get.
-        cost[cost >= _GATE_SIGMAS**2] = _NEVER
-        return {
-            int(row): Hit.of(frame, pool[column])
-            for row, column in zip(*linear_sum_assignment(cost), strict=True)
-            if cost[row, column] < _GATE_SIGMAS**2
-        }
+        good = np.flatnonzero(distance < _GATE_SIGMAS**2)
+        row = row[good]
+        columns, column = np.unique(column[good], return_inverse=True)
+        cost = np.full((len(self._tracks), len(columns)), _NEVER)
+        cost[row, column] = distance[good]
+        candidate = np.full(cost.shape, -1)
+        candidate[row, column] = good
+        row, column = linear_sum_assignment(cost)
+        best = candidate[row, column]
+        return row[best >= 0], spots[best[best >= 0]]
 
     def _closer_look(
         self, track: Track, frame: PastFrame, history: History, taken: list[Array]
@@ -226,13 +248,15 @@ class Tracker:
 
         Its place is that of the track and the spot together, since such a spot's own is poor.
         """
-        state, covariance = track.predict(frame.stamp_ns)
+        ((state,), (covariance,)) = predict([track], frame.stamp_ns)
         place = frame.pixels(state[None, :2])[0]
         if not frame.contains(place[None], BORDER_PX)[0]:
             return None
         if np.linalg.norm(covariance[:2, :2], 2) > _SURE_PX**2:
             return None
-        found = self._look(frame, _without(track, frame, history, _SELF_PX), place)
+        hidden = _hidden([track], frame, history, _SELF_PX)[:, 0]
+        others = zip(history.others(frame), hidden, strict=True)
+        found = self._look(frame, [other for other, itself in others if not itself], place)
         if not len(found):
             return None
         spot = found[0].copy()
@@ -248,16 +272,28 @@ class Tracker:
         taken.append(xy)
         return Hit.of(frame, spot)
 
-    def _refined(self, track: Track, frame: PastFrame, history: History, hit: Hit) -> Hit:
-        """The hit, measured again with what is known of the track."""
-        frames = list(history)
-        index = frame.number - frames[0].number
-        neighbour = frames[index - 1 if index else 1]
-        motion = (track.place(frame) - track.place(neighbour)) * (1 if index else -1)
-        if np.hypot(*motion) < _SLOW_PX and track.length > _LONGEST_POINT_PX:
-            return hit
-        behind = _without(track, frame, history, _WINGS_PX)
-        return Hit.of(frame, self._refine(frame, behind, hit.spot, motion))
+    def _refined(
+        self,
+        tracks: Sequence[Track],
+        frame: PastFrame,
+        history: History,
+        spots: NDArray[np.void],
+    ) -> list[Hit]:
+        """The hits of tracks at spots, measured again with what is known of the tracks."""
+        if not tracks:
+            return []
+        index = frame.number - history[0].number
+        neighbour = history[index - 1 if index else 1]
+        motions = (places(tracks, frame) - places(tracks, neighbour)) * (1 if index else -1)
+        slow = np.hypot(motions[:, 0], motions[:, 1]) < _SLOW_PX
+        long = np.array([track.length for track in tracks]) > _LONGEST_POINT_PX
+        rows = np.flatnonzero(~(slow & long))
+        hidden = _hidden(tracks, frame, history, _WINGS_PX)[:, rows]
+        spots = spots.copy()
+        spots[rows] = self._refine(
+            frame, history.others(frame), spots[rows], motions[rows], hidden
+        )
+        return Hit.of_all(frame, spots)
 
     def _new_tracks(
         self,
@@ -272,17 +308,17 @@ class Tracker:
         sightings = {sighting.frame.number: sighting for sighting in self._sightings}
         links = find_links(self._sightings, log_limit + _CANDIDATE_LOG, max_speed_px)
         finds = [
-            (drift.log_false, {n: _as_spots(frames[n], [row])[0] for n, row in drift.rows.items()})
+            (drift.log_false, {n: _as_spots(frames[n], [row]) for n, row in drift.rows.items()})
             for drift in drifts
         ]
         finds += [
-            (link.log_false, {n: sightings[n].spots[row] for n, row in link.rows.items()})
+            (link.log_false, {n: sightings[n].spots[[row]] for n, row in link.rows.items()})
             for link in links
         ]
         born: list[Track] = []
         candidates: list[Track] = []
         for log_false, spots in finds:
-            hits = {number: Hit.of(frames[number], spot) for number, spot in spots.items()}
+            hits = {number: Hit.of_all(frames[number], spot)[0] for number, spot in spots.items()}
             if _is_still(hits):
                 # Where many defects are known, more are not.
                 log_false += np.log(1 + _UNKNOWN_DEFECTS * defects)
@@ -291,8 +327,8 @@ class Tracker:
                 continue
             track.fit()
             track.hits = {
-                number: self._refined(track, frames[number], history, hit)
-                for number, hit in hits.items()
+                number: self._refined([track], frames[number], history, spot)[0]
+                for number, spot in spots.items()
             }
             track.fit()
             if log_false > log_limit:
@@ -303,7 +339,7 @@ class Tracker:
             track.track_id = self._last_id
             born.append(track)
             for number, hit in track.hits.items():
-                sightings[number].free &= ~_pieces(sightings[number].spots, hit)
+                _take(sightings[number], [hit])
         return born, candidates
 
     def _look_back(self, track: Track, history: History, others: list[Track]) -> None:
@@ -318,14 +354,13 @@ class Tracker:
         track.fit()
 
 
-def _without(track: Track, frame: PastFrame, history: History, reach_px: float) -> list[PastFrame]:
-    """Frames that show what is behind a track in a frame, and not the track itself."""
-    place = track.place(frame)[None]
-    return [
-        other
-        for other in history.others(frame)
-        if np.hypot(*(track.place(other) - other.pixels_of(frame, place)[0])) > reach_px
-    ]
+def _hidden(
+    tracks: Sequence[Track], frame: PastFrame, history: History, reach_px: float
+) -> NDArray[np.bool_]:
+    """Which other frames show N tracks themselves at their places in a frame, (F, N)."""
+    ages = np.array([abs(o.stamp_ns - frame.stamp_ns) / 1e9 for o in history.others(frame)])
+    speeds = np.array([track.speed for track in tracks])
+    return ages[:, None] * speeds <= reach_px
 
 
 def _frame_seconds(history: History) -> float:
@@ -348,39 +383,60 @@ def _as_spots(frame: PastFrame, rows: Sequence[int] | NDArray[np.intp]) -> NDArr
     return spots
 
 
-def _distances(track: Track, frame: PastFrame, spots: NDArray[np.void], known: int) -> Array:
-    """Squared statistical distance of each spot from where the track is expected, (N,).
+def _candidates(
+    tracks: Sequence[Track], frame: PastFrame, sighting: Sighting
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.void], Array]:
+    """What tracks may take: the row of the track, and a number, the spot and its distance.
 
-    The first `known` are spots, the others objects.  A fast track takes spots, since it would
-    take stars among the objects; a slow one takes objects of its brightness and shape, since a
-    spot is only that side of it which has moved.
+    Distances are squared and statistical, from where the track is expected.  A fast track takes
+    spots, since it would take stars among the objects; a slow one takes objects of its brightness
+    and shape, since a spot is only that side of it which has moved.
     """
-    state, covariance = track.predict(frame.stamp_ns)
-    xy = np.stack([spots["x"], spots["y"]], axis=1)
-    off = frame.sky(xy) - state[:2]
-    step = np.hypot(*state[2:]) * track.frame_s
-    ratio = np.log(np.maximum(spots["flux"], 1e-9) / max(track.flux, 1e-9)) / np.log(_FLUX_RATIO)
-    longer = np.maximum(spots["length"] - track.length, 0) / _LONGER_PX
-    distance = np.full(len(spots), _NEVER)
-    for row in np.flatnonzero(np.hypot(*off.T) < 50 + step / 2):
-        spread = covariance[:2, :2] + Hit.of(frame, spots[row]).covariance
-        spread += _SPREAD_PX**2 * np.eye(2)
-        distance[row] = off[row] @ np.linalg.solve(spread, off[row])
+    states, spread = predict(tracks, frame.stamp_ns)
+    expected = states[:, :2]
+    step = np.array([track.speed * track.frame_s for track in tracks])
+    centre, reach, slow = as_complex(expected), _FARTHEST_PX + step / 2, step <= _SLOW_PX
+    index = sighting.spots["object_index"]
+    near = [(i, k, d < reach[i]) for i, k, d in sighting.near(centre, reach)]
+    row, number, good = (np.concatenate(part) for part in zip(*near, strict=True))
+    good &= ~slow[row] | (index[number] >= 0)
+    row, number = row[good], number[good]
+    rest = np.ones(len(frame.objects), bool)
+    rest[index[index >= 0]] = False
+    rest = np.flatnonzero(rest)
+    objects = as_complex(frame.object_sky[rest])
+    slow_row = np.flatnonzero(slow)
+    which, column = np.nonzero(np.abs(objects - centre[slow_row, None]) < reach[slow_row, None])
+    spots = np.concatenate([sighting.spots[number], _as_spots(frame, rest[column])])
+    row = np.concatenate([row, slow_row[which]])
+    number = np.concatenate([number, len(sighting.spots) + rest[column]])
+
+    off = frame.sky(np.stack([spots["x"], spots["y"]], axis=1)) - expected[row]
+    spread = spread[row, :2, :2] + covariances(frame, spots) + _SPREAD_PX**2 * np.eye(2)
+    distance = np.sum(off * np.linalg.solve(spread, off[:, :, None])[:, :, 0], axis=1)
+    flux, length = (
+        np.array([getattr(track, name) for track in tracks])[row] for name in ("flux", "length")
+    )
+    ratio = np.log(np.maximum(spots["flux"], 1e-9) / np.maximum(flux, 1e-9)) / np.log(_FLUX_RATIO)
+    longer = np.maximum(spots["length"] - length, 0) / _LONGER_PX
     distance += ratio**2 + longer**2
-    is_object = spots["object_index"] >= 0
-    if step > _SLOW_PX:
-        distance[known:] = _NEVER
-    else:
-        distance[~is_object | (np.abs(ratio) > 1)] = _NEVER
-    return distance
+    distance[slow[row] & (np.abs(ratio) > 1)] = _NEVER
+    return row, number, spots, distance
 
 
-def _pieces(spots: NDArray[np.void], hit: Hit) -> NDArray[np.bool_]:
-    """Which spots are the hit, or pieces of its streak, (N,)."""
-    dx, dy = spots["x"] - hit.spot["x"], spots["y"] - hit.spot["y"]
-    cos, sin = np.cos(hit.spot["angle"]), np.sin(hit.spot["angle"])
-    along, across = np.abs(dx * cos + dy * sin), np.abs(dy * cos - dx * sin)
-    return (along <= hit.spot["length"] / 2 + _PIECE_PX) & (across <= _PIECE_PX)
+def _take(sighting: Sighting, hits: list[Hit]) -> None:
+    """Mark the spots that are hits, or pieces of their streaks, as taken."""
+    if not hits:
+        return
+    taken = np.array([hit.spot for hit in hits], SPOT_DTYPE)
+    x, y, angle, half = taken["x"], taken["y"], taken["angle"], taken["length"] / 2 + _PIECE_PX
+    sky = np.array([hit.sky for hit in hits])
+    # A little more than the half diagonal of what a piece is in.
+    for hit, row, _ in sighting.near(as_complex(sky), 1 + np.hypot(half, _PIECE_PX)):
+        dx, dy = sighting.spots["x"][row] - x[hit], sighting.spots["y"][row] - y[hit]
+        cos, sin = np.cos(angle[hit]), np.sin(angle[hit])
+        along, across = np.abs(dx * cos + dy * sin), np.abs(dy * cos - dx * sin)
+        sighting.free[row[(along <= half[hit]) & (across <= _PIECE_PX)]] = False
 
 
 def _same(track: Track, other: Track) -> bool:
@@ -389,5 +445,5 @@ def _same(track: Track, other: Track) -> bool:
     for number, hit in track.hits.items():
         if number in other.hits:
             reach = _PIECE_PX + hit.spot["length"] / 2
-            shared += bool(np.hypot(*(other.hits[number].xy - hit.xy)) < reach)
+            shared += math.dist(other.hits[number].xy, hit.xy) < reach
     return shared >= 2
