@@ -57,9 +57,8 @@ def annotate(
         _stretch(image, result), None, fx=zoom, fy=zoom, interpolation=cv2.INTER_NEAREST
     )
     picture = cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR)
-    flow = result.flow
-    for row in result.star_rows:
-        _draw_vector(picture, flow.position[row], flow.displacement[row] * scale, zoom, _STAR)
+    flow, stars = result.flow, result.star_rows
+    _draw_vectors(picture, flow.position[stars], flow.displacement[stars] * scale, zoom, _STAR)
     for rso in result.detections:
         _draw_rso(picture, rso, result.dt_s * scale, zoom)
     for track in result.tracks[result.tracks["status"] == COASTING]:
@@ -103,23 +102,25 @@ def _asinh(values: NDArray[np.float32], level: float, noise: float) -> NDArray[n
     return np.minimum(shown, 255).astype(np.uint8)
 
 
-def _draw_vector(
+def _draw_vectors(
     picture: NDArray[np.uint8],
-    origin: NDArray[np.float64],
-    vector: NDArray[np.float64],
+    origins: NDArray[np.float64],
+    vectors: NDArray[np.float64],
     zoom: int,
     colour: tuple[int, int, int],
 ) -> None:
-    """A line from the object to where it goes, and a dot on it so that no motion shows, too."""
-    start, end = _fixed(origin, zoom), _fixed(origin + vector, zoom)
-    cv2.line(picture, start, end, colour, 1, cv2.LINE_AA, _SHIFT)
-    cv2.circle(picture, start, 2 << _SHIFT, colour, 1, cv2.LINE_AA, _SHIFT)
+    """Lines from objects to where they go, and a dot on each so that no motion shows, too."""
+    starts, ends = _fixed(origins, zoom), _fixed(origins + vectors, zoom)
+    for start, end in zip(starts.tolist(), ends.tolist(), strict=True):
+        cv2.line(picture, start, end, colour, 1, cv2.LINE_AA, _SHIFT)
+        cv2.circle(picture, start, 2 << _SHIFT, colour, 1, cv2.LINE_AA, _SHIFT)
 
 
 def _draw_rso(picture: NDArray[np.uint8], rso: np.void, seconds: float, zoom: int) -> None:
     confirmed = rso["status"] == CONFIRMED
     velocity = np.array([rso["vx"], rso["vy"]])
-    _draw_vector(picture, np.array([rso["x"], rso["y"]]), velocity * seconds, zoom, _RSO)
+    origin = np.array([rso["x"], rso["y"]])
+    _draw_vectors(picture, origin[None], velocity[None] * seconds, zoom, _RSO)
     name = f"#{rso['track_id']} " if confirmed else ""
     label = f"{name}{np.hypot(*velocity):.2f} px/s SNR {rso['snr']:.0f}"
     _draw_box(picture, rso, zoom, _RSO, confirmed, label)
@@ -136,7 +137,7 @@ def _draw_box(
     """A square around a place, or only its corners, and a text to the right of it."""
     centre = np.array([row["x"], row["y"]])
     half = _BOX_MARGIN_PX + np.nan_to_num(row["length"]) / 2
-    start, end = _fixed(centre - half, zoom), _fixed(centre + half, zoom)
+    start, end = (_fixed(centre + way, zoom).tolist() for way in (-half, half))
     if closed:
         cv2.rectangle(picture, start, end, colour, 1, cv2.LINE_AA, _SHIFT)
     else:
@@ -169,7 +170,6 @@ def _write(
     cv2.putText(picture, text, at, _FONT, 0.42, colour, 1, cv2.LINE_AA)
 
 
-def _fixed(xy: NDArray[np.float64], zoom: int) -> tuple[int, int]:
-    """A point of the image in the picture's fixed-point pixels."""
-    x, y = np.rint(((xy + 0.5) * zoom - 0.5) * (1 << _SHIFT)).astype(int)
-    return int(x), int(y)
+def _fixed(xy: NDArray[np.float64], zoom: int) -> NDArray[np.int_]:
+    """Points of the image in the picture's fixed-point pixels."""
+    return np.rint(((xy + 0.5) * zoom - 0.5) * (1 << _SHIFT)).astype(int)

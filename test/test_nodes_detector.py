@@ -291,6 +291,68 @@ def test_picture_is_drawn_only_while_somebody_listens(monkeypatch):
     assert pictures[0].width / width == pictures[0].height / height >= 1
 
 
+@pytest.mark.parametrize("reliable", [True, False])
+def test_a_slow_picture_delays_no_answer(reliable, monkeypatch):
+    """Live, the frames in between are not drawn; with reliable input all are."""
+    begun, proceed = [], threading.Event()
+
+    def slow(picture, result, annotate=report.annotate, **options):
+        begun.append(result.frame)
+        assert proceed.wait(PATIENCE_S)
+        return annotate(picture, result, **options)
+
+    monkeypatch.setattr(report, "annotate", slow)
+    frames = sky(6)
+    with Graph("-p", f"reliable_input:={reliable}".lower()) as graph:
+        station = Station(graph)
+        pictures = graph.listen(Image, "image_annotated")
+        graph.connect(*station.outputs("image_annotated"))
+        # One is being drawn, one waits; a third would have to wait with reliable input.
+        answered = frames[:3] if reliable else frames
+        for frame in answered:
+            station.send(image(frame))
+            graph.until(lambda: begun)
+        assert begun == [0]
+        proceed.set()
+        for frame in frames[len(answered) :]:
+            station.send(image(frame))
+        wanted = range(6) if reliable else (0, 5)
+        graph.until(lambda: len(pictures) == len(wanted))
+        graph.serve(0.2)
+    assert stamps(station.clouds) == [f.stamp_ns for f in frames]
+    assert stamps(pictures) == [frames[number].stamp_ns for number in wanted]
+
+
+def test_a_frame_that_fails_clears_the_markers_of_the_one_before():
+    frames = sky(2)
+    broken = image(frames[1])
+    broken.encoding = "yuv422"
+    with Graph(*RELIABLE) as graph:
+        station = Station(graph)
+        arrays = graph.listen(MarkerArray, "flow_markers")
+        graph.connect(*station.outputs("flow_markers"))
+        station.send(image(frames[0]), broken)
+        graph.until(lambda: len(arrays) == 2)
+    assert stamps([a.markers[0] for a in arrays]) == [f.stamp_ns for f in frames]
+    assert [m.action for m in arrays[1].markers] == [Marker.DELETEALL]
+
+
+def test_diagnostics_say_where_the_time_goes():
+    frames = sky(4)
+    pipeline = Pipeline()
+    stages = [pipeline.process(f.image, f.stamp_ns).seconds for f in frames][-1]
+    with Graph(*RELIABLE) as graph:
+        station = Station(graph)
+        station.send(*map(image, frames))
+        told = values(station.diagnostics_when(lambda s: values(s)["frames_processed"] == "4"))
+    profile = {k[8:-3]: float(v) for k, v in told.items() if k.startswith("profile_")}
+    steps = {"receive", "wait", "convert", "process", "publish", "draw"}
+    assert profile.keys() == steps | stages.keys()
+    assert 0 < sum(profile[stage] for stage in stages) <= profile["process"] * 1.001  # 4 digits
+    assert np.isnan(profile["draw"])
+    assert profile["receive"] > 0
+
+
 def test_a_picture_that_cannot_be_drawn_costs_no_answer(monkeypatch):
     def broken(image, result, **options):
         raise IndexError("no such colour")

@@ -90,7 +90,7 @@ def test_a_failure_is_said_until_a_frame_succeeds(clock):
     one.image_received(1, has_stamp=True)
     one.failed("the image is too short")
     assert "the image is too short" in problems(one)[0]
-    one.processed(FrameResult(0, 0, (10, 10), reason="no object"), latency_s=0.1)
+    one.processed(FrameResult(0, 0, (10, 10), reason="no object"), latency_s=0.1, seconds={})
     assert problems(one) == []
     assert one.summary() == "no object"
     assert one.values()["frames_failed"] == one.values()["frames_processed"] == 1
@@ -133,7 +133,7 @@ def frame(**values) -> FrameResult:
 
 def test_values_are_those_of_the_last_frame(clock):
     one = health()
-    one.processed(frame(), latency_s=0.1)
+    one.processed(frame(), latency_s=0.1, seconds={})
     expected = {"frame": 6, "stamp_ns": 123, "objects": 8, "stars": 5, "spots": 7}
     expected |= {"rso_confirmed": 2, "rso_candidates": 1, "tracks": 3, "tracks_coasting": 1}
     expected |= {"noise_dn": 2.5, "background_dn": 1000.0, "threshold_dn": 10.0}
@@ -149,7 +149,7 @@ def test_without_a_star_field_its_motion_is_unknown(clock):
     one = health()
     none = rows(DETECTION_DTYPE)
     why = "the 3 flow vectors do not agree on a motion of the star field"
-    one.processed(frame(star_field=None, detections=none, reason=why), latency_s=0.1)
+    one.processed(frame(star_field=None, detections=none, reason=why), latency_s=0.1, seconds={})
     values = one.values()
     motion = [value for name, value in values.items() if name.startswith("star_")]
     assert len(motion) == 6
@@ -162,10 +162,27 @@ def test_rate_is_of_the_last_seconds(clock):
     one = health()
     for _ in range(41):
         clock[0] += 0.25
-        one.processed(FrameResult(0, 0, (10, 10)), latency_s=0.1)
+        one.processed(FrameResult(0, 0, (10, 10)), latency_s=0.1, seconds={})
     assert one.values()["rate_hz"] == pytest.approx(4.0)
     clock[0] += 20
     assert one.values()["rate_hz"] == 0.0
+
+
+def test_the_profile_is_the_mean_of_the_last_second(clock):
+    one = health()
+    one.processed(FrameResult(0, 0, (10, 10)), latency_s=0.1, seconds={"convert": 9.0})
+    clock[0] += 2
+    one.processed(FrameResult(0, 1, (10, 10)), latency_s=0.1, seconds={"convert": 0.001})
+    clock[0] += 0.5
+    last = {"convert": 0.002, "tracking": 0.03}
+    one.processed(FrameResult(0, 2, (10, 10)), latency_s=0.1, seconds=last)
+    assert one.values()["profile_convert_ms"] == pytest.approx(1.5)
+    assert one.values()["profile_tracking_ms"] == pytest.approx(15)  # none in the frame before
+    assert np.isnan(one.values()["profile_draw_ms"])
+    one.drawn(0.25)
+    clock[0] += 60
+    assert one.values()["profile_draw_ms"] == 250
+    assert one.values()["profile_convert_ms"] == pytest.approx(1.5)  # when images stop, it stays
 
 
 @pytest.mark.parametrize(
@@ -197,7 +214,7 @@ def test_it_may_be_read_while_frames_are_answered():
 
     def answer() -> None:
         while not ended.is_set():
-            one.processed(result, latency_s=0.1)
+            one.processed(result, latency_s=0.1, seconds={})
 
     worker = threading.Thread(target=answer)
     usual_s = sys.getswitchinterval()

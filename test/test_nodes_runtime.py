@@ -47,8 +47,42 @@ def test_live_inbox_loses_nothing_in_a_hiccup_and_all_but_the_newest_in_an_overl
 def test_live_inbox_never_blocks():
     inbox = Inbox(depth=1, backlog_s=60.0)
     half = Inbox.LIMIT_BYTES // 2
-    assert [inbox.put(number, half) for number in range(4)] == [0, 0, 2, 0]
-    assert inbox.get() == 2
+    assert [inbox.put(number, half) for number in range(4)] == [0, 0, 2, 1]
+    assert inbox.get() == 3
+
+
+def test_in_an_overload_nothing_waits_behind_another_until_the_worker_keeps_up(monkeypatch):
+    now_s = 100.0
+    monkeypatch.setattr(runtime.time, "monotonic", lambda: now_s)
+    inbox = Inbox(depth=3, backlog_s=0.5)
+    inbox.put(0, MEGABYTE)
+    now_s += 0.6
+    assert inbox.put(1, MEGABYTE) == 1
+    for number in range(2, 20):  # three come while one is in work
+        now_s += 0.1
+        assert inbox.put(number, MEGABYTE) == (number % 3 != 1)
+        if number % 3 == 0:
+            assert inbox.get() == number
+    for number in range(20, 26):  # each is taken when it comes
+        assert inbox.get() == number - 1
+        now_s += 0.1
+        assert inbox.put(number, MEGABYTE) == 0
+    assert inbox.get() == 25
+    threading.Timer(0.1, inbox.put, (26, MEGABYTE)).start()
+    assert inbox.get() == 26  # the worker had to wait, long after the last one was replaced
+    assert [inbox.put(number, MEGABYTE) for number in (27, 28)] == [0, 0]
+
+
+def test_a_picture_in_work_and_one_that_waits_are_all_that_is_kept():
+    inbox = Inbox(depth=1, backlog_s=None, limit_bytes=0)
+    inbox.put(0, 1)
+    thread = threading.Thread(target=inbox.put, args=(1, 1))
+    thread.start()
+    thread.join(0.1)
+    assert thread.is_alive()
+    assert inbox.get() == 0
+    thread.join(5)
+    assert inbox.get() == 1
 
 
 def test_full_inbox_blocks_until_there_is_room():
@@ -90,7 +124,7 @@ def test_signals_end_every_node_within_a_second(number, tmp_path):
     bag = write_bag(tmp_path / "bag", sky(2), topic="/nobody")
     arguments = {
         "detector": (),  # it works on the simulator's images when the signal comes
-        "simulator": ("--ros-args", "-p", "rate:=5.0"),
+        "simulator": ("--ros-args", "-p", "rate:=20.0"),
         "player": (f"{bag}",),
         "recorder": ("--ros-args", "-p", f"output:={tmp_path / 'output'}"),
     }

@@ -26,11 +26,11 @@ from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
-from ofsat_ros import report
 from ofsat_ros.detection import DETECTION_DTYPE
 from ofsat_ros.images import EncodingError, decode_message
 from ofsat_ros.nodes import messages
-from ofsat_ros.nodes.health import Health
+from ofsat_ros.nodes.drawing import Drawing
+from ofsat_ros.nodes.health import Health, timed
 from ofsat_ros.nodes.ros_parameters import NodeParameters, start_value
 from ofsat_ros.nodes.runtime import (
     Inbox,
@@ -41,7 +41,7 @@ from ofsat_ros.nodes.runtime import (
     run,
 )
 from ofsat_ros.parameters import DEFAULT_PRESET, DetectorParameters, Parameters, Table
-from ofsat_ros.pipeline import FrameResult, ImageError, Pipeline
+from ofsat_ros.pipeline import ImageError, Pipeline
 from ofsat_ros.tracking import TRACK_DTYPE
 
 # Results are small; a subscriber may be this far behind and lose none.
@@ -81,8 +81,10 @@ class Detector(Node):
         self._elsewhere: list[str] = []  # other topics with images, if nobody publishes ours
         self._health = Health(self._images.topic_name, own.reliable_input, profile_path())
         self._said_silence = False
-        self._drawn: tuple[Header, float] | None = None  # markers that are to be seen, since when
-        self._closed = False
+        self._drawing = Drawing(
+            self, self._markers, self._annotated, own.reliable_input, self._health
+        )
+        self._callbacks_s: float | None = None  # CPU time of their thread at the end of the last
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/enable", self._on_enable)
         # Steady: diagnostics go on when a player's clock stands still.
@@ -94,8 +96,8 @@ class Detector(Node):
 
     def close(self) -> None:
         """End the worker; a frame in work may still be answered."""
-        self._closed = True
         self._inbox.close()
+        self._drawing.close()
         self._worker.join(0.5)
 
     def _create_publishers(self) -> None:
@@ -130,13 +132,24 @@ class Detector(Node):
             self._pipeline.parameters = table
 
     def _on_image(self, message: Image | CompressedImage, info: dict) -> None:
+        received_s = time.monotonic()
         # Each sender counts for itself, so numbers tell of losses only while there is one.
         sequence = info["publication_sequence_number"] if self._image_publishers == 1 else None
         stamp_ns = messages.stamp_ns(message.header.stamp)
         self._health.image_received(sequence, has_stamp=stamp_ns != 0)
+        seconds = {"receive": self._callback_cpu_s()}
         if self._health.enabled:
-            item = (message, time.monotonic())
+            item = (message, received_s, seconds)
             self._health.dropped(self._inbox.put(item, len(message.data)))
+
+    def _callback_cpu_s(self) -> float:
+        """CPU time that the callbacks' thread took since the last call, s.
+
+        It is spent in the middleware, before the message is there, so that no clock can be read
+        around it.
+        """
+        before, self._callbacks_s = self._callbacks_s, time.thread_time()
+        return 0.0 if before is None else self._callbacks_s - before
 
     def _on_incompatible(self, event) -> None:
         policy = qos_policy_name_from_kind(event.last_policy_kind)
@@ -157,36 +170,45 @@ class Detector(Node):
 
     def _work(self) -> None:
         while (item := self._inbox.get()) is not None:
-            message, received_s = item
             try:
-                self._answer(message, received_s)
+                self._answer(*item)
                 # Each frame's own numbers; those of the timer go on when no image comes.
                 if self._diagnostics.get_subscription_count():
                     self._publish_diagnostics()
             # Nothing that is drawn or sent may end the thread, and with it all answers.
             except Exception:  # noqa: BLE001
-                if self._closed:
+                if self._inbox.closed:
                     return
                 self.get_logger().error(traceback.format_exc())
 
-    def _answer(self, message: Image | CompressedImage, received_s: float) -> None:
+    def _answer(
+        self, message: Image | CompressedImage, received_s: float, seconds: dict[str, float]
+    ) -> None:
+        """Answer an image; `seconds` takes what each step of it needs."""
+        seconds["wait"] = time.monotonic() - received_s
         if self._reset_wanted:
             self._pipeline.reset(self._reset_wanted)
             self._reset_wanted = ""
-        scale = self._settings[DetectorParameters].marker_scale
+        header = message.header
         try:
-            image = decode_message(message)
-            result = self._pipeline.process(image, messages.stamp_ns(message.header.stamp))
+            with timed(seconds, "convert"):
+                image = decode_message(message)
+            with timed(seconds, "process"):
+                result = self._pipeline.process(image, messages.stamp_ns(header.stamp))
         except (EncodingError, ImageError) as error:
-            self._fail(message.header, str(error))
+            self._fail(header, str(error))
         # Whatever an image does to the stages, it must not take the node down.
         except Exception as error:  # noqa: BLE001
             self.get_logger().error(traceback.format_exc())
-            self._fail(message.header, f"{type(error).__name__}: {error}")
+            self._fail(header, f"{type(error).__name__}: {error}")
             self._pipeline.reset("an error in the frame before")
         else:
-            self._publish(message.header, image, result, scale)
-            self._health.processed(result, time.monotonic() - received_s)
+            with timed(seconds, "publish"):
+                self._publish_clouds(header, result.detections, result.tracks)
+                self._motion.publish(messages.star_field_vector(header, result))
+            self._health.processed(result, time.monotonic() - received_s, seconds | result.seconds)
+            scale = self._settings[DetectorParameters].marker_scale
+            self._drawing.show(header, image, result, scale)
 
     def _fail(self, header: Header, why: str) -> None:
         """Answer an image that could not be processed: nothing found, and nothing stale left."""
@@ -196,20 +218,7 @@ class Detector(Node):
         )
         self._publish_clouds(header, np.zeros(0, DETECTION_DTYPE), np.zeros(0, TRACK_DTYPE))
         self._motion.publish(messages.star_field_vector(header, None))
-        self._markers.publish(messages.no_flow_markers(header))
-        self._drawn = None
-
-    def _publish(
-        self, header: Header, image: np.ndarray, result: FrameResult, scale: float
-    ) -> None:
-        self._publish_clouds(header, result.detections, result.tracks)
-        self._motion.publish(messages.star_field_vector(header, result))
-        if self._markers.get_subscription_count():
-            self._markers.publish(messages.flow_markers(header, result, scale))
-            self._drawn = (header, time.monotonic())
-        if self._annotated.get_subscription_count():
-            picture = report.annotate(image, result, scale=scale)
-            self._annotated.publish(messages.image_message(header, picture))
+        self._drawing.clear(header)
 
     def _publish_clouds(self, header: Header, detections: np.ndarray, tracks: np.ndarray) -> None:
         self._detections.publish(messages.detections_cloud(header, detections))
@@ -224,17 +233,15 @@ class Detector(Node):
         # To say how it is must not end what works.
         except Exception:  # noqa: BLE001
             self.get_logger().error(traceback.format_exc(), throttle_duration_sec=_WARN_EVERY_S)
+        self._callbacks_s = time.thread_time()
 
     def _clear_stale_markers(self) -> None:
-        """Delete what is drawn when images stop: viewers would show it for ever."""
+        """Delete what is drawn when images stop."""
         timeout_s = self._settings[DetectorParameters].no_image_timeout_s
         goes_on = self._health.enabled and self._health.silence_s() <= timeout_s
-        drawn = self._drawn
         # A slow frame is answered long after its image has come: its markers stay as long, too.
-        if drawn is None or goes_on or time.monotonic() - drawn[1] <= timeout_s:
-            return
-        self._drawn = None
-        self._markers.publish(messages.no_flow_markers(drawn[0]))
+        if not goes_on:
+            self._drawing.clear_after(timeout_s)
 
     def _look_around(self) -> None:
         self._image_publishers = self.count_publishers(self._images.topic_name)

@@ -9,7 +9,8 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,18 @@ from ofsat_ros.tracking import COASTING
 _RECENT_S = 10.0
 # More of the newest frames are not needed for a rate.
 _FRAMES_IN_RATE = 200
+# s; a stage's time is its mean over it, or that of the last frame.
+_PROFILE_S = 1.0
+
+
+@contextmanager
+def timed(seconds: dict[str, float], step: str) -> Iterator[None]:
+    """Put the time that the ``with`` takes into `seconds`, s."""
+    start_s = time.perf_counter()
+    try:
+        yield
+    finally:
+        seconds[step] = time.perf_counter() - start_s
 
 
 class Health:
@@ -49,6 +62,8 @@ class Health:
         self._last_sequence: int | None = None
         self._processed_at: deque[float] = deque(maxlen=_FRAMES_IN_RATE)
         self._latency_s = float("nan")
+        self._profile_of: deque[tuple[float, Mapping[str, float]]] = deque(maxlen=_FRAMES_IN_RATE)
+        self._drawing_s = float("nan")
         self._failure = ""
         self._incompatible = ""
         self._zero_stamp = False
@@ -73,14 +88,33 @@ class Health:
             self._counts["dropped"] += count
             self._last_drop_s = time.monotonic()
 
-    def processed(self, result: FrameResult, latency_s: float) -> None:
-        """Take note of a frame's result and of the time from its receipt to its answer."""
+    def processed(
+        self, result: FrameResult, latency_s: float, seconds: Mapping[str, float]
+    ) -> None:
+        """Take note of a frame's result.
+
+        Parameters
+        ----------
+        result : FrameResult
+        latency_s : float
+            From its receipt to its answer, s.
+        seconds : mapping of str to float
+            What each step took, s, in their order.
+        """
+        now = time.monotonic()
         with self._lock:
             self._counts["processed"] += 1
-            self._processed_at.append(time.monotonic())
+            self._processed_at.append(now)
+            self._profile_of.append((now, seconds))
+            while now - self._profile_of[0][0] > _PROFILE_S:
+                self._profile_of.popleft()
             self._latency_s = latency_s
             self._result = result
             self._failure = ""
+
+    def drawn(self, seconds: float) -> None:
+        """Take note of how long drawing took, s."""
+        self._drawing_s = seconds
 
     def failed(self, why: str) -> None:
         """Take note of a frame that could not be processed."""
@@ -173,7 +207,12 @@ class Health:
             values |= {f"frames_{key}": count for key, count in self._counts.items()}
             values |= {"rate_hz": self._rate_hz(), "latency_s": self._latency_s}
             result = self._result
-        return values if result is None else values | _frame_values(result)
+            recent = [seconds for _, seconds in self._profile_of]
+        if result is None:
+            return values
+        profile = _means(recent) | {"draw": self._drawing_s}
+        steps = {f"profile_{step}_ms": 1e3 * seconds for step, seconds in profile.items()}
+        return values | _frame_values(result) | steps
 
     def _rate_hz(self) -> float:
         now = time.monotonic()
@@ -218,6 +257,11 @@ def _frame_values(result: FrameResult) -> dict[str, Any]:
         "processing_s": sum(result.seconds.values()),
         "nothing_detected_because": result.reason,
     }
+
+
+def _means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Mean of each step that the last row has; a row without a step counts as 0."""
+    return {step: sum(row.get(step, 0.0) for row in rows) / len(rows) for step in rows[-1]}
 
 
 def _relative(topic: str) -> str:

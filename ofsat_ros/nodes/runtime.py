@@ -8,6 +8,7 @@ own worker thread, so that a slow frame delays no service, parameter or diagnost
 
 from __future__ import annotations
 
+import _thread
 import argparse
 import ctypes
 import os
@@ -21,7 +22,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import resources
-from typing import Any
+from typing import Any, NoReturn
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -56,20 +57,23 @@ class Inbox:
         None: none is lost; `put` blocks only when `depth` messages wait and one more would exceed
         `LIMIT_BYTES`.  So up to 1 GiB is held whatever the depth, and more than that only for the
         first `depth` messages.  A number: when one has waited for longer, or there is no room,
-        the next replaces all that wait, so that a hiccup loses none and an overload is caught up
-        with at once.
+        the next replaces all that wait, and so does each from then on, until the worker keeps up
+        for as long: a hiccup loses none, and in an overload nothing waits behind another.
     """
 
     # The middleware overwrites what is not taken from it in time, without a word; so memory, not
     # a count of frames, bounds how far a reliable sender may run ahead of the worker.
     LIMIT_BYTES = 1 << 30
 
-    def __init__(self, depth: int, backlog_s: float | None) -> None:
-        self._depth = depth
+    def __init__(
+        self, depth: int, backlog_s: float | None, limit_bytes: int = LIMIT_BYTES
+    ) -> None:
+        self._depth, self._limit_bytes = depth, limit_bytes
         self._backlog_s = backlog_s
         self._items: deque[tuple[Any, int, float]] = deque()  # message, size, when it came
         self._bytes = 0
-        self._closed = False
+        self.closed = False
+        self._overloaded, self._replaced_s = False, 0.0
         self._changed = threading.Condition()
 
     def put(self, item: Any, size: int) -> int:
@@ -78,10 +82,13 @@ class Inbox:
             replaced = 0
             now_s = time.monotonic()
             if self._backlog_s is None:
-                self._changed.wait_for(lambda: self._closed or self._has_room(size))
+                self._changed.wait_for(lambda: self.closed or self._has_room(size))
             elif self._items and (
-                now_s - self._items[0][2] >= self._backlog_s or not self._has_room(size)
+                self._overloaded
+                or now_s - self._items[0][2] >= self._backlog_s
+                or not self._has_room(size)
             ):
+                self._overloaded, self._replaced_s = True, now_s
                 replaced = len(self._items)
                 self._items.clear()
                 self._bytes = 0
@@ -93,8 +100,10 @@ class Inbox:
     def get(self) -> Any | None:
         """Wait for the next message and return it; None once closed."""
         with self._changed:
-            self._changed.wait_for(lambda: self._closed or self._items)
-            if self._closed:
+            if self._overloaded and not self._items:
+                self._overloaded = time.monotonic() - self._replaced_s <= (self._backlog_s or 0)
+            self._changed.wait_for(lambda: self.closed or self._items)
+            if self.closed:
                 return None
             item, size, _ = self._items.popleft()
             self._bytes -= size
@@ -104,12 +113,12 @@ class Inbox:
     def close(self) -> None:
         """Release whoever waits; what is inside is dropped."""
         with self._changed:
-            self._closed = True
+            self.closed = True
             self._items.clear()
             self._changed.notify_all()
 
     def _has_room(self, size: int) -> bool:
-        return len(self._items) < self._depth or self._bytes + size <= self.LIMIT_BYTES
+        return len(self._items) < self._depth or self._bytes + size <= self._limit_bytes
 
 
 def overridable_qos() -> QoSOverridingOptions:
@@ -171,12 +180,18 @@ def run(
     Returns
     -------
     int
-        Exit code: 0 after an orderly end, 1 after a failure, 2 if it could not start.
+        Exit code of a node that could not start: 2.  Of others the process ends here: with 0 after
+        an orderly end, 1 after a failure.
     """
     stop = threading.Event()
+
+    def on_signal(*_: object) -> None:
+        # Not here: this may have interrupted the main thread while it holds the event's own lock.
+        _thread.start_new_thread(stop.set, ())
+
     # Ours instead of rclpy's or Python's: no exception then breaks into whatever runs.
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+        signal.signal(number, on_signal)
     prepare_for_large_images()
     node = None
     try:
@@ -199,7 +214,7 @@ def prepare_for_large_images() -> None:
     _use_packaged_profile()
 
 
-def _serve(node: Node, stop: threading.Event) -> int:
+def _serve(node: Node, stop: threading.Event) -> NoReturn:
     failures: list[BaseException] = []
     executor = SingleThreadedExecutor()
     executor.add_node(node)
@@ -229,13 +244,11 @@ def _serve(node: Node, stop: threading.Event) -> int:
     rclpy.try_shutdown()
     if failures:
         raise failures[0]
-    exit_code = getattr(node, "exit_code", 0)
-    if any(other.daemon and other.is_alive() for other in threading.enumerate()):
-        # It is inside a long native call; Python's own end would pull the ground from under it.
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(exit_code)
-    return exit_code
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # All that is ours is closed.  Python's own end would take longer than that, and would pull the
+    # ground from under a thread that is still inside a long native call.
+    os._exit(getattr(node, "exit_code", 0))
 
 
 def _one_line(error: Exception) -> str:

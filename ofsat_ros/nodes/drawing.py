@@ -1,0 +1,120 @@
+"""What the detector draws for people: ``flow_markers`` and ``image_annotated``.
+
+It stands after the answer, in a thread of its own: nothing is drawn that nobody looks at, and
+what is drawn delays no answer.  A live camera's frames are left out when drawing falls behind or
+would take more than half a core; with reliable input every frame is drawn, and a viewer slows the
+replay down instead.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+import traceback
+from dataclasses import dataclass
+
+import numpy as np
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from std_msgs.msg import Header
+
+from ofsat_ros import report
+from ofsat_ros.nodes import messages
+from ofsat_ros.nodes.health import Health
+from ofsat_ros.nodes.runtime import Inbox
+from ofsat_ros.pipeline import FrameResult
+
+# s; the longest rest between two pictures.
+_REST_S = 0.2
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """What is to be drawn: an image and its result."""
+
+    image: np.ndarray
+    result: FrameResult
+    scale: float
+
+
+class Drawing:
+    """Draws the newest result while the detector goes on.
+
+    Parameters
+    ----------
+    node : Node
+        Its logger says what went wrong.
+    markers, pictures : Publisher
+        Of MarkerArray and Image.
+    every_frame : bool
+        Whether no frame may be left out.
+    health : Health
+        Told how long it took.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        markers: Publisher,
+        pictures: Publisher,
+        every_frame: bool,
+        health: Health,
+    ) -> None:
+        self._logger = node.get_logger()
+        self._markers, self._pictures, self._health = markers, pictures, health
+        self._every_frame = every_frame
+        # One in work and one that waits: more would only take memory.
+        self._inbox = Inbox(1, None if every_frame else 0.0, limit_bytes=0)
+        self._shown: tuple[Header, float] | None = None  # markers that are to be seen, since when
+        self._thread = threading.Thread(target=self._work, name="drawing", daemon=True)
+        self._thread.start()
+
+    def show(self, header: Header, image: np.ndarray, result: FrameResult, scale: float) -> None:
+        """Have a result drawn, if anybody looks."""
+        if self._markers.get_subscription_count() or self._pictures.get_subscription_count():
+            self._inbox.put((header, _Scene(image, result, scale)), image.nbytes)
+
+    def clear(self, header: Header) -> None:
+        """Have the markers deleted after a frame that gave nothing."""
+        self._inbox.put((header, None), 0)
+
+    def clear_after(self, seconds: float) -> None:
+        """Delete markers that are older; viewers would show them for ever."""
+        shown = self._shown
+        if shown is not None and time.monotonic() - shown[1] > seconds:
+            self._shown = None
+            self._markers.publish(messages.no_flow_markers(shown[0]))
+
+    def close(self) -> None:
+        """End the thread, after the picture in work."""
+        self._inbox.close()
+        self._thread.join(0.2)
+
+    def _work(self) -> None:
+        while (item := self._inbox.get()) is not None:
+            start_s = time.perf_counter()
+            try:
+                self._draw(*item)
+            # A viewer gets no picture of this frame; the next may succeed.
+            except Exception:  # noqa: BLE001
+                if self._inbox.closed:
+                    return
+                self._logger.error(traceback.format_exc())
+            taken_s = time.perf_counter() - start_s
+            if item[1] is not None:
+                self._health.drawn(taken_s)
+            if not self._every_frame:
+                time.sleep(min(taken_s, _REST_S))
+
+    def _draw(self, header: Header, scene: _Scene | None) -> None:
+        if scene is None:
+            self._shown = None
+            self._markers.publish(messages.no_flow_markers(header))
+            return
+        if self._markers.get_subscription_count():
+            array = messages.flow_markers(header, scene.result, scene.scale)
+            self._markers.publish(array)
+            self._shown = (header, time.monotonic())
+        if self._pictures.get_subscription_count():
+            picture = report.annotate(scene.image, scene.result, scale=scene.scale)
+            self._pictures.publish(messages.image_message(header, picture))
