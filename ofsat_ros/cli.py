@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import json
 import sys
-from collections import Counter
-from collections.abc import Callable
-from contextlib import ExitStack
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -91,6 +92,7 @@ def _option_type(about: Description) -> Any:
     " labels what it was seen as before it was confirmed",
 )
 @click.option("--force", is_flag=True, help="replace the results of an earlier run")
+@click.option("--profile", is_flag=True, help="print a table of where the time went")
 @_parameter_options
 def process(
     recording: Path,
@@ -99,6 +101,7 @@ def process(
     preset: str,
     live: bool,
     force: bool,
+    profile: bool,
     **changes: Any,
 ) -> None:
     """Detect RSOs in RECORDING: a rosbag2 folder, a bare .mcap or .db3 file, or a ROS 1 bag."""
@@ -122,15 +125,42 @@ def process(
     if not totals.frames:
         _fail(f"no frame of {recording} could be processed")
     click.echo(f"{totals}; {DETECTIONS}, {TRACKS} and {STAR_FIELD} are in {output}")
+    if profile:
+        click.echo(totals.profile())
 
 
 class _Totals:
-    """Counts for the summary."""
+    """Counts and times for the summary."""
 
     def __init__(self) -> None:
         self.frames = self.left_out = 0
         self.detections: Counter[int] = Counter()
         self.reason = ""
+        self.reading_s = 0.0  # in its own thread, beside all others
+        self._seconds: dict[str, float] = defaultdict(float)  # none overlap
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[dict[str, float]]:
+        """Count the time of a stage; that of its parts, which it may be told of, apart."""
+        parts: dict[str, float] = {}
+        start_s = time.perf_counter()
+        try:
+            yield parts
+        finally:
+            taken_s = time.perf_counter() - start_s
+            for part, seconds in (*parts.items(), (stage, taken_s - sum(parts.values()))):
+                self._seconds[part] += seconds
+
+    def profile(self) -> str:
+        """Return a table of where the time went."""
+        frames, whole_s = max(self.frames, 1), sum(self._seconds.values())
+        lines = [f"{'stage':<26}{'ms per frame':>12}{'share':>8}"]
+        rows = sorted(self._seconds.items(), key=lambda row: -row[1])
+        rows += [("all", whole_s), ("reading, meanwhile", self.reading_s)]
+        for stage, seconds in rows:
+            name, share = stage.replace("_", " "), f"{seconds / whole_s:.1%}"
+            lines.append(f"{name:<26}{1e3 * seconds / frames:>12.2f}{share:>8}")
+        return "\n".join(lines)
 
     def __str__(self) -> str:
         words = f"{in_words(self.detections)} in {self.frames} frames"
@@ -158,13 +188,18 @@ def _process(
             if not live:
                 write(last.stamp_ns, number, last.detections)
 
+    coming = iter(tqdm(frames, unit=" frames", dynamic_ncols=True, disable=None))
     try:
-        for given, frame in enumerate(
-            tqdm(frames, unit=" frames", dynamic_ncols=True, disable=None)
-        ):
-            number = given + frames.skipped
+        while True:
+            with totals.timed("waiting for frames"):
+                frame = next(coming, None)
+            if frame is None:
+                break
+            number = frame.number
             try:
-                result = pipeline.process(frame.image, frame.stamp_ns)
+                with totals.timed("other") as stages:
+                    result = pipeline.process(frame.image, frame.stamp_ns)
+                    stages |= result.seconds
             except ImageError as error:
                 refused += 1
                 if refused == 1:
@@ -173,15 +208,18 @@ def _process(
             if result.reset and totals.frames:
                 _say(f"note: frame {number} starts afresh: {result.reset}")
             numbers[result.frame] = number
-            writer.add_star_field(replace(result, frame=number))
-            if live:
-                write(result.stamp_ns, number, result.detections)
-            write_settled(result.settled)
+            with totals.timed("writing"):
+                writer.add_star_field(replace(result, frame=number))
+                if live:
+                    write(result.stamp_ns, number, result.detections)
+                write_settled(result.settled)
             totals.frames += 1
             totals.reason = result.reason
     finally:
         # Also when stopped or torn off: what was seen is not lost.
-        write_settled(pipeline.finish())
+        with totals.timed("the last frames' last word"):
+            write_settled(pipeline.finish())
+        totals.reading_s = frames.seconds
     totals.left_out = refused + frames.skipped
     for problem in frames.problems:
         _say(f"note: {problem}")

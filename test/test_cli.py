@@ -208,6 +208,22 @@ def test_process_live_writes_what_the_node_would_say(small: Path, tmp_path: Path
     assert min(int(row["frame"]) for row in rows) == 2  # three frames make a track
 
 
+def test_process_says_where_the_time_went(small: Path, tmp_path: Path):
+    done = succeeds("process", small, "-o", tmp_path, "--profile")
+    summary, head, *lines = done.stdout.splitlines()
+    assert summary.endswith(f"star_field.csv are in {tmp_path}")
+    assert head.split() == ["stage", "ms", "per", "frame", "share"]
+    table = {line[:26].strip(): line[26:].split() for line in lines}
+    stages = {name.replace("_", " ") for name in run_pipeline(small)[0][-1].seconds}
+    around = {"waiting for frames", "other", "writing", "the last frames' last word"}
+    assert list(table)[-2:] == ["all", "reading, meanwhile"]
+    assert table.keys() == stages | around | {"all", "reading, meanwhile"}
+    parts = [float(table[name][0]) for name in stages | around]
+    assert sum(parts) == pytest.approx(float(table["all"][0]), abs=0.1)  # each to 0.005
+    assert table["all"][1] == "100.0%"
+    assert float(table["reading, meanwhile"][0]) > 0
+
+
 # Evaluate
 
 

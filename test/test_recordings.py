@@ -1,5 +1,7 @@
 """Bags in and out: every storage and compression, and every way a bag can be bad."""
 
+import threading
+
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Rosbag1Writer
@@ -541,6 +543,58 @@ def test_frames_are_views_of_the_messages(tmp_path):
     simple_bag(tmp_path / "bag")
     with open_recording(tmp_path / "bag") as recording:
         assert not next(iter(recording)).image.flags.owndata
+
+
+def test_frames_bear_their_place_in_the_recording(tmp_path):
+    messages = three_images()
+    messages[1][1].encoding = "yuv422"
+    with open_recording(write_foreign(tmp_path / "bag", messages)) as recording:
+        assert [frame.number for frame in recording] == [0, 2]
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_frames_are_read_ahead_in_one_thread(storage, tmp_path, monkeypatch):
+    threads, decoded = set(), []
+    two_more = threading.Event()
+
+    def watched(self, data, msgtype, deserialize=Bag.deserialize):
+        threads.add(threading.current_thread())
+        decoded.append(data)
+        if len(decoded) == 3:
+            two_more.set()
+        return deserialize(self, data, msgtype)
+
+    monkeypatch.setattr(Bag, "deserialize", watched)
+    with open_recording(simple_bag(tmp_path / "bag", 6, storage=storage)) as recording:
+        frames = iter(recording)
+        assert next(frames).stamp_ns == stamp_of(1)
+        assert two_more.wait(10), "while the first is in work"
+        assert [frame.stamp_ns for frame in frames] == [stamp_of(n) for n in range(2, 7)]
+        assert recording.seconds > 0
+    (thread,) = threads
+    assert thread is not threading.current_thread()
+    assert not thread.is_alive(), "it ends with the recording"
+
+
+def test_reading_goes_no_further_ahead_than_two_frames(tmp_path, monkeypatch):
+    decoded = []
+
+    def watched(self, data, msgtype, deserialize=Bag.deserialize):
+        decoded.append(data)
+        return deserialize(self, data, msgtype)
+
+    monkeypatch.setattr(Bag, "deserialize", watched)
+    with open_recording(simple_bag(tmp_path / "bag", 9)) as recording:
+        next(iter(recording))
+    assert len(decoded) <= 3
+
+
+def test_a_new_look_ends_the_one_before(tmp_path):
+    with open_recording(simple_bag(tmp_path / "bag", 6)) as recording:
+        first = iter(recording)
+        next(first)
+        assert [frame.number for frame in recording] == list(range(6))
+        assert list(first) == []
 
 
 def test_a_closed_recording_says_so(tmp_path):

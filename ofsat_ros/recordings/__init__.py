@@ -9,7 +9,10 @@ not) and ROS 1 bags.
 
 from __future__ import annotations
 
+import time
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -33,6 +36,8 @@ __all__ = [
 ]
 
 _PROBLEMS_KEPT = 10
+# Frames that are read while one is in work; more would only take memory.
+_AHEAD = 2
 _NS = 1_000_000_000
 
 
@@ -48,11 +53,14 @@ class Frame:
         Stamp of the header, ns UTC.
     frame_id : str
         Coordinate frame of the header.
+    number : int
+        Its place among the images of the recording, those that could not be decoded included.
     """
 
     image: np.ndarray
     stamp_ns: int
     frame_id: str
+    number: int = 0
 
 
 def open_recording(path: str | Path, topic: str | None = None) -> Recording:
@@ -76,9 +84,18 @@ def open_recording(path: str | Path, topic: str | None = None) -> Recording:
         If there is nothing at `path`, or nothing readable, or no image topic, or several and none
         is chosen.
     """
+    thread = ThreadPoolExecutor(1, "recording")
+    try:
+        return thread.submit(_open, path, topic, thread).result()
+    except RecordingError:
+        thread.shutdown()
+        raise
+
+
+def _open(path: str | Path, topic: str | None, thread: ThreadPoolExecutor) -> Recording:
     bag = Bag(path)
     try:
-        return Recording(bag, _choose(bag, topic))
+        return Recording(bag, _choose(bag, topic), thread)
     except RecordingError:
         bag.close()
         raise
@@ -87,8 +104,9 @@ def open_recording(path: str | Path, topic: str | None = None) -> Recording:
 class Recording:
     """The frames of one image topic; a context manager.
 
-    Iterating yields every `Frame` in the order of the bag.  A frame that cannot be decoded is left
-    out, counted and named; so is the rest of a bag that is damaged from some frame on.
+    Iterating yields every `Frame` in the order of the bag, each read and decoded ahead in a thread
+    while the one before is in work.  A frame that cannot be decoded is left out, counted and
+    named; so is the rest of a bag that is damaged from some frame on.
 
     Attributes
     ----------
@@ -103,11 +121,16 @@ class Recording:
         Why the last iteration ended before the recording's end; empty if it did not.
     problems : list of str
         What the user should know of the last iteration: why frames were skipped (the first ones),
-        stamps that were missing, an index that does not agree.
+        stamps that were missing, an index that does not agree.  Complete when it has ended.
+    seconds : float
+        Time that the last iteration's reading and decoding took, in its own thread, s.
     """
 
-    def __init__(self, bag: Bag, topic: str) -> None:
+    def __init__(self, bag: Bag, topic: str, thread: ThreadPoolExecutor) -> None:
         self._bag = bag
+        # All that the bag does is done in this one thread, which SQLite may ask for.
+        self._thread: ThreadPoolExecutor | None = thread
+        self._coming: deque[Future[Frame | None]] = deque()
         self.path = bag.path
         self.topic = topic
         self.topics = {name: about.count for name, about in bag.topics.items() if about.is_image}
@@ -120,14 +143,41 @@ class Recording:
         self.close()
 
     def close(self) -> None:
-        """Close the files."""
-        self._bag.close()
+        """Close the files; a second call does nothing."""
+        thread, self._thread = self._thread, None
+        if thread is None:
+            return
+        self._give_up()
+        thread.submit(self._bag.close).result()
+        thread.shutdown()
 
     def __len__(self) -> int:
         """Return the count of frames that the recording's index tells of."""
         return self.topics[self.topic]
 
     def __iter__(self) -> Iterator[Frame]:
+        if self._thread is None:
+            raise RecordingError(f"{self.path} is closed: open it again to read it")
+        self._give_up()
+        frames = self._read()
+        coming = deque(self._thread.submit(self._next, frames) for _ in range(_AHEAD))
+        self._coming = coming
+        while coming and (frame := coming.popleft().result()) is not None:
+            coming.append(self._thread.submit(self._next, frames))
+            yield frame
+
+    def _give_up(self) -> None:
+        """Read no further ahead; an iteration that is under way ends."""
+        while self._coming:
+            self._coming.pop().cancel()
+
+    def _next(self, frames: Iterator[Frame]) -> Frame | None:
+        start_s = time.perf_counter()
+        frame = next(frames, None)
+        self.seconds += time.perf_counter() - start_s
+        return frame
+
+    def _read(self) -> Iterator[Frame]:
         self._start_over()
         count = 0
         try:
@@ -151,6 +201,7 @@ class Recording:
     def _start_over(self) -> None:
         self.skipped = 0
         self.torn = ""
+        self.seconds = 0.0
         self.problems = list(self._bag.problems)
         self._said_no_stamp = False
 
@@ -167,7 +218,7 @@ class Recording:
         if stamp_ns == 0:
             stamp_ns = received_ns
             self._say_no_stamp(number)
-        return Frame(image, stamp_ns, message.header.frame_id)
+        return Frame(image, stamp_ns, message.header.frame_id, number)
 
     def _skip(self, number: int, reason: str) -> None:
         self.skipped += 1
