@@ -25,7 +25,7 @@ help:
 	$(say) 'make demo   replay a sample bag to the detector over DDS; results in demo_output/'
 	$(say) 'make test   run all tests'
 	$(say) 'make lint   check format, style and types'
-	$(say) "make bench  the paper's scenes, and detection beside its peers, as tables"
+	$(say) "make bench  the paper's scenes, detection beside its peers, and speed, as tables"
 	$(say) 'make clean  remove everything that make and colcon made'
 
 .PHONY: demo
@@ -53,6 +53,9 @@ bench: $(STAMP)
 	@$(BIN)/python -m benchmarks.paper
 	$(say) 'bench: detection beside the published method and SExtractor'
 	@$(BIN)/python -m benchmarks.detection
+	$(say) 'bench: speed against SExtractor, and throughput over DDS'
+	@$(BIN)/python -m benchmarks.speed
+	@$(BIN)/python -m benchmarks.throughput
 
 .PHONY: clean
 clean:

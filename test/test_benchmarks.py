@@ -6,6 +6,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import rclpy
+
+from benchmarks import speed, throughput
 
 ROOT = Path(__file__).parents[1]
 
@@ -54,3 +57,68 @@ def test_sensitivity_at_the_ends_of_its_curve():
 def test_the_papers_scenes():
     told = run("paper", "--frames", "8", "--brightness", "1")
     assert cells(told, "robust, sparse")[1:4] == ["5 of 5", "35 of 35", "0.00"]
+
+
+SKY = speed.Sky(256, 192, 40)
+
+
+@pytest.fixture
+def rendered(tmp_path: Path) -> Path:
+    speed.render(tmp_path, SKY, speed._FRAMES)
+    return tmp_path
+
+
+def test_speed_of_one_row(rendered: Path):
+    row = speed.alone(speed.measure, rendered, SKY, "robust")
+    assert len(row.ours) == 4
+    assert row.ratio == pytest.approx(sorted(row.ours)[1:3][0] / row.sep, rel=1)
+    assert 0 < row.copy < row.sep
+    assert sum(row.stages.values()) < 1.5 * max(row.ours)
+    # NumPy, OpenCV and SciPy alone take more than 50 MB; frames of this size, next to nothing.
+    assert 50e6 < row.peak < 400e6
+    assert 20 < row.objects < 80
+    (cells_of_row,) = speed._speed_table({"sky": row}).splitlines()[2:]
+    assert cells_of_row.startswith("| sky | ")
+    head, _, stages = speed._stage_table({"sky": row}).splitlines()
+    assert head.count("|") == stages.count("|") == 2 + len(row.stages)
+
+
+def test_four_skies_move_alike(rendered: Path):
+    from ofsat_ros.pipeline import Pipeline
+
+    fourfold = speed.Sky(512, 384, 160, fourfold=True)
+    assert fourfold.rendered == SKY
+    one, four = Pipeline(), Pipeline()
+    for number in range(4):
+        small, large = (speed.load(rendered, sky, number) for sky in (SKY, fourfold))
+        assert large.shape == (384, 512)
+        single = one.process(small, speed.stamp_ns(number))
+        both = four.process(large, speed.stamp_ns(number))
+    assert single.star_field.star_count > 20
+    assert both.star_field.star_count > 3 * single.star_field.star_count
+    # Along x; the mirrored parts would otherwise be no stars of this field.
+    assert both.star_field.displacement == pytest.approx(single.star_field.displacement, abs=0.05)
+
+
+def test_memory_and_command(rendered: Path):
+    after, peak = speed.alone(speed.memory, rendered, SKY, 55, 6)
+    assert set(after) == {50, 51, 52, 53, 55}
+    assert all(50e6 < size <= 1.01 * peak for size in after.values())
+    read_s, process_s, command_s = speed.alone(speed.process_bag, rendered, SKY)
+    assert 0 < read_s < process_s
+    assert command_s > 0
+
+
+def test_frames_over_dds(tmp_path: Path):
+    speed.render(tmp_path, SKY, 6, (0.0, 0.0))
+    rclpy.init()
+    try:
+        said, sent, frame_s = throughput.overhead(tmp_path, SKY)
+        assert "beside `process`" in said
+        assert "nan" not in said
+        assert "`rso_detections`" in sent
+        assert 0 < frame_s < 1
+        told = throughput.replay(tmp_path, SKY, 20)
+        assert told.startswith("0 lost, 0 repeated, in order; ")
+    finally:
+        rclpy.shutdown()
