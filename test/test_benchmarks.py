@@ -70,7 +70,7 @@ def rendered(tmp_path: Path) -> Path:
 
 def test_speed_of_one_row(rendered: Path):
     row = speed.alone(speed.measure, rendered, SKY, "robust")
-    assert len(row.ours) == 4
+    assert len(row.ours) == speed._MEASURED
     assert row.ratio == pytest.approx(sorted(row.ours)[1:3][0] / row.sep, rel=1)
     assert 0 < row.copy < row.sep
     assert sum(row.stages.values()) < 1.5 * max(row.ours)
