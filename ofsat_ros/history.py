@@ -100,10 +100,6 @@ class PastFrame:
         """Points (N, 2) of the sky plane in this frame, (N, 2) px."""
         return _transform(self.from_sky, sky)
 
-    def pixels_of(self, other: PastFrame, xy: Array) -> Array:
-        """Where stars seen at points (N, 2) px of another frame are in this one, (N, 2) px."""
-        return _transform(self.from_sky @ other.to_sky, xy)
-
     def contains(self, xy: Array, margin: float = 0.0) -> NDArray[np.bool_]:
         """Whether points (N, 2) px are at least `margin` px inside the image, (N,)."""
         height, width = self.shape

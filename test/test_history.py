@@ -99,7 +99,7 @@ def test_a_star_stays_at_its_place_of_the_sky_whatever_the_field_does():
         assert frame.sky(place) == pytest.approx(places[0], abs=1e-9)
         assert frame.pixels(places[0]) == pytest.approx(place, abs=1e-9)
         for other, there in zip(history, places, strict=True):
-            assert other.pixels_of(frame, place) == pytest.approx(there, abs=1e-9)
+            assert other.pixels(frame.sky(place)) == pytest.approx(there, abs=1e-9)
 
 
 def test_the_motion_that_the_stars_show_puts_them_back():
