@@ -200,9 +200,11 @@ class Pipeline:
         _check(image)
         parameters = self.parameters
         result = FrameResult(stamp_ns, self._frames, (image.shape[0], image.shape[1]))
+        # Given away: what is in it from now on is this frame's.
+        spare, self._spare = self._spare, None
         with _timed(result.seconds, "preprocessing"):
             try:
-                pre = preprocess(image, parameters, self._sensor, self._spare)
+                pre = preprocess(image, parameters, self._sensor, spare)
             except ValueError as error:
                 raise ImageError(str(error)) from error
         self._frames += 1

@@ -807,3 +807,17 @@ def test_what_was_learned_of_another_camera_is_forgotten():
     memory.begin((64, 64), 5.0, np.dtype(np.uint8))
     memory.add(np.zeros((64, 64), np.float32), 0)
     assert memory.finish().tolist() == [20 * 64 + 30]
+
+
+def test_after_a_change_of_the_test_frames_are_compared_as_ever():
+    """A full history hands on the memory of frames that leave it: to one frame only."""
+    changed, fresh = Pipeline(), Pipeline(Parameters(rso_test="vector"))
+    images = [as16(SURVEY.image(frame)) for frame in range(16)]
+    for frame, image in enumerate(images):
+        if frame == 12:
+            changed.parameters = Parameters(rso_test="vector")
+        a, b = (pipeline.process(image, stamp(frame)) for pipeline in (changed, fresh))
+        if frame > 12:
+            np.testing.assert_array_equal(a.flow.displacement, b.flow.displacement)
+            assert a.detections.tobytes() == b.detections.tobytes()
+    assert np.hypot(*a.star_field.displacement) > 0.5
