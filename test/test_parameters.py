@@ -14,13 +14,18 @@ import ofsat_ros
 from ofsat_ros.parameters import (
     DEFAULT_PRESET,
     TABLES,
+    CameraParameters,
     Description,
     DetectorParameters,
+    GuideParameters,
     ParameterError,
     Parameters,
     PlayerParameters,
     RecorderParameters,
     SimulatorParameters,
+    Table,
+    TdmWriterParameters,
+    TrackingDataParameters,
     markdown_table,
     preset_names,
 )
@@ -31,12 +36,16 @@ STAGES = {
     *("preprocessing", "objects", "optical_flow", "star_field"),
     *("detection", "tracking", "pipeline"),
 }
-UNITS = {"_px": "px", "_s": "s"}
+UNITS = {
+    **{"_px": "px", "_deg_s": "deg/s", "_deg_s2": "deg/s^2"},
+    **{"_hz": "Hz", "_mag": "mag", "_s": "s"},
+}
 # Numbers that count or scale, and so have no unit.
 PURE = {
     *("threshold_sigmas", "outlier_sigmas", "rso_sigmas", "spot_sigmas", "max_objects"),
     *("max_corners", "false_tracks"),
     *("corner_quality", "pyramid_levels", "dense_pyramid_levels", "dense_iterations"),
+    *("target_id", "least_detections"),
     *("dense_noise_threshold", "marker_scale", "rate", "wait_for_subscribers", "seed", "frames"),
 }
 
@@ -90,15 +99,28 @@ def test_stages_are_the_pipelines_and_the_nodes():
         "player": PlayerParameters,
         "simulator": SimulatorParameters,
         "recorder": RecorderParameters,
+        "camera": CameraParameters,
+        "guide": GuideParameters,
+        "tracking_data": TrackingDataParameters,
+        "tdm_writer": TdmWriterParameters,
     }
     for stage, table in nodes.items():
         assert {p.stage for p in table.describe()} == {stage}
     assert set(TABLES) == {Parameters, *nodes.values()}
 
 
-def test_a_node_reads_no_name_twice():
-    detector = [p.name for table in (Parameters, DetectorParameters) for p in table.describe()]
-    assert len(set(detector)) == len(detector)
+@pytest.mark.parametrize(
+    "tables",
+    [
+        (Parameters, CameraParameters, DetectorParameters),
+        (Parameters, CameraParameters, TrackingDataParameters),
+        (TrackingDataParameters, TdmWriterParameters),
+    ],
+    ids=["detector", "ofsat process", "tdm_writer"],
+)
+def test_nobody_reads_a_name_twice(tables: tuple[type[Table], ...]):
+    names = [about.name for table in tables for about in table.describe()]
+    assert len(set(names)) == len(names)
 
 
 def test_the_table_is_in_the_order_of_the_fields():
