@@ -7,13 +7,20 @@ a frame with the history and leave it to ``tracking`` to tell RSOs from noise.
 from ofsat_ros.detection.appearance import BORDER_PX, SPOT_DTYPE, find_spots, spot_near
 from ofsat_ros.detection.drift import Drift, find_drifting
 from ofsat_ros.detection.refinement import refine
-from ofsat_ros.detection.two_frames import CANDIDATE, CONFIRMED, DETECTION_DTYPE, detect
+from ofsat_ros.detection.two_frames import (
+    CANDIDATE,
+    CONFIRMED,
+    DETECTION_DTYPE,
+    DIRECTION_FIELDS,
+    detect,
+)
 
 __all__ = [
     "BORDER_PX",
     "CANDIDATE",
     "CONFIRMED",
     "DETECTION_DTYPE",
+    "DIRECTION_FIELDS",
     "SPOT_DTYPE",
     "Drift",
     "detect",

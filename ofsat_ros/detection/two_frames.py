@@ -16,6 +16,9 @@ CANDIDATE, CONFIRMED = 0, 1
 # Gaussian width of a point source in the smoothed image, px: a PSF of about 1 and the smoothing.
 _POINT_WIDTH_PX = 1.4
 
+# What only a calibrated camera and an attitude give (`camera`); unknown until then.
+DIRECTION_FIELDS = ("sight", "ra", "dec", "sigma_ra", "sigma_dec")
+
 DETECTION_DTYPE = np.dtype(
     [
         ("x", "f8"),  # centroid, px
@@ -30,8 +33,11 @@ DETECTION_DTYPE = np.dtype(
         ("flux", "f8"),  # DN
         ("length", "f8"),  # px
         ("angle", "f8"),  # rad, from x to y
+        ("sight", "f8", (3,)),  # unit line of sight, optical frame; NaN without calibration
         ("ra", "f8"),  # rad, ICRS; NaN without attitude
         ("dec", "f8"),
+        ("sigma_ra", "f8"),  # std along the equator (of ra times cos dec), rad
+        ("sigma_dec", "f8"),
         ("significance", "f8"),  # of the motion against the field, in sigmas
         ("track_id", "u4"),  # 0: not confirmed
         ("status", "u1"),  # CANDIDATE or CONFIRMED
@@ -151,7 +157,7 @@ def _detections(
     found["flow_index"], found["object_index"] = rows, index
     found["x"], found["y"] = flow.position[rows].T
     found["sigma_x"], found["sigma_y"] = flow.sigma[rows].T
-    for name in ("snr", "flux", "length", "angle", "ra", "dec"):
+    for name in ("snr", "flux", "length", "angle", *DIRECTION_FIELDS):
         found[name] = np.nan
     owned = index >= 0
     for name in ("x", "y", "sigma_x", "sigma_y", "snr", "flux", "length", "angle"):

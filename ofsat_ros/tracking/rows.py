@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ofsat_ros.detection import CONFIRMED, DETECTION_DTYPE, SPOT_DTYPE
+from ofsat_ros.detection import CONFIRMED, DETECTION_DTYPE, DIRECTION_FIELDS, SPOT_DTYPE
 from ofsat_ros.history import History, PastFrame
 from ofsat_ros.tracking.track import Track, predict
 
@@ -34,8 +34,11 @@ TRACK_DTYPE = np.dtype(
         ("flux", "f8"),  # DN
         ("length", "f8"),  # px
         ("angle", "f8"),  # rad, from x to y
+        ("sight", "f8", (3,)),  # unit line of sight, optical frame; NaN without calibration
         ("ra", "f8"),  # rad, ICRS; NaN without attitude
         ("dec", "f8"),
+        ("sigma_ra", "f8"),  # std along the equator (of ra times cos dec), rad
+        ("sigma_dec", "f8"),
         ("age", "f8"),  # s since the first hit
         ("hits", "i4"),
         ("misses", "i4"),  # frames in which it was expected and not seen
@@ -92,7 +95,8 @@ def _rows(
     for name in ("x", "y", "sigma_x", "sigma_y", "snr", "flux", "length", "angle"):
         rows[name] = spots[name]
     _set_velocities(rows, states, frame, history)
-    rows["ra"] = rows["dec"] = np.nan
+    for name in DIRECTION_FIELDS:
+        rows[name] = np.nan
     rows["significance"] = spots["excess"]
     rows["track_id"], rows["status"] = [track.track_id for track in tracks], status
     rows["object_index"], rows["flow_index"] = spots["object_index"], -1
@@ -119,7 +123,8 @@ def track_rows(tracks: Sequence[Track], history: History) -> NDArray[np.void]:
     spots = np.array([track.last.spot for track in tracks], SPOT_DTYPE)
     for name in ("snr", "flux", "length", "angle"):
         rows[name] = spots[name]
-    rows["ra"] = rows["dec"] = np.nan
+    for name in DIRECTION_FIELDS:
+        rows[name] = np.nan
     rows["age"] = [(frame.stamp_ns - track.born_ns) / 1e9 for track in tracks]
     rows["hits"] = [track.hit_count for track in tracks]
     rows["misses"] = [track.missed for track in tracks]
