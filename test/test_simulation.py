@@ -221,6 +221,62 @@ def test_displacement_is_that_of_the_star_now_at_the_centre():
     assert np.hypot(*frame.displacement_px) > 15
 
 
+# --- camera and attitude ----------------------------------------------------------------------
+
+
+def test_the_camera_is_ideal():
+    camera = simulate(width=301, height=200, pixel_scale_arcsec=5).camera
+    assert (camera.width, camera.height) == (301, 200)
+    focal_px = 1 / math.radians(5 / 3600)
+    np.testing.assert_allclose(camera.matrix, [[focal_px, 0, 150], [0, focal_px, 99.5], [0, 0, 1]])
+
+
+def test_attitude_without_motion_has_north_up_and_east_left():
+    attitude = simulate(**DARK).frame().attitude
+    # To the vernal equinox, east of it, and to the north pole.
+    np.testing.assert_allclose(
+        attitude.apply(np.eye(3)), [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], atol=1e-12
+    )
+
+
+def test_the_attitude_is_that_of_mid_exposure():
+    turning = {"field_rotation_rad_s": 0.2, "exposure_s": 2.0, "period_s": 3.0, "jitter_std_px": 5}
+    simulator = simulate(camera_rate_arcsec_s=(30, -40), **turning, **DARK)
+    first, second = simulator.frame(), simulator.frame()
+    # The field angle turns x towards y: at 0.2 and 0.8 rad.
+    for frame, angle in ((first, 0.2), (second, 0.8)):
+        x_axis = frame.attitude.apply([0, -1, 0])  # west, from where x was to the right
+        np.testing.assert_allclose(x_axis, [math.cos(angle), math.sin(angle), 0], atol=1e-3)
+    # And the boresight is where the plane's origin was at the start, 50 arcsec/s away in 1 s.
+    west, south = first.attitude.inv().apply([0, 0, 1])[1:] * -1
+    turned = np.exp(-0.1j) * complex(30, -40) * np.sinc(0.1 / np.pi)
+    expected = np.radians([turned.real / 3600, turned.imag / 3600])
+    assert (west, south) == pytest.approx(expected, rel=1e-6)
+
+
+def test_stars_move_in_the_image_as_the_attitude_says():
+    simulator = scenario("geo", 7)
+    first, *others = (simulator.frame() for _ in range(4))
+    star = first.attitude.inv().apply([[0, 0, 1]])
+    (pixel,) = simulator.camera.pixels(others[-1].attitude.apply(star))
+    expected = sum(frame.displacement_px for frame in others)
+    # The simulated sky is flat: over these 100 arcsec that is below 1e-3 px.
+    np.testing.assert_allclose(pixel - 255.5, expected, atol=1e-3)
+
+
+def test_velocity_against_the_stars_is_the_rsos_own():
+    settings = {"pixel_scale_arcsec": 2.5, "camera_rate_arcsec_s": (15, -5), "period_s": 2.0}
+    settings |= {"width": 200, "height": 160, "star_count": 0, "field_rotation_rad_s": 0.05}
+    rsos = (RSO((90, 80), (10, -15), 100), RSO((900, 80), (1, 2), 9), RSO((30, 9), (0, 0), 50))
+    simulator = simulate(rsos=rsos, **settings)
+    for angle in (0.025, 0.125):  # of the field, in mid-exposure
+        frame = simulator.frame()
+        c, s = math.cos(angle), math.sin(angle)
+        own = np.array([[4, -6], [0, 0]]) @ np.array([[c, s], [-s, c]])
+        assert frame.truth["id"].tolist() == [1, 3]
+        np.testing.assert_allclose(frame.relative_velocity_px_s, own, atol=1e-12)
+
+
 # --- sky --------------------------------------------------------------------------------------
 
 
@@ -826,7 +882,8 @@ def test_truth_file(tmp_path):
 def test_scenarios_have_a_line_each():
     plain = ["geo", "sidereal", "survey", "empty", "fast", "slow"]
     spoilt = ["hot_pixels", "vignetting", "clouds", "cosmic_rays", "tumbling", "jitter", "ugly"]
-    assert list(SCENARIOS) == plain + spoilt
+    guided = ["guide_drift", "guide_leo"]
+    assert list(SCENARIOS) == plain + spoilt + guided
     assert all(line and "\n" not in line for line in SCENARIOS.values())
 
 

@@ -10,9 +10,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ofsat_ros.camera import Camera
 from ofsat_ros.parameters import ParameterError
+from ofsat_ros.simulation.exposure import Simulator, looking_at
+from ofsat_ros.simulation.mount import SimulatedMount
+from ofsat_ros.simulation.plane import SkySimulator
 from ofsat_ros.simulation.settings import RSO, SimulatorSettings
-from ofsat_ros.simulation.simulator import SkySimulator
+from ofsat_ros.simulation.sphere import SphereSimulator, Target
 
 _STARS_PER_PX = 8e-4
 # One RSO each, from easy to barely visible.
@@ -20,9 +24,19 @@ _SNRS = (60, 30, 15, 8, 5)
 
 
 class _Scene(NamedTuple):
+    """A scene on a plane sky."""
+
     summary: str
     settings: dict[str, Any]
     rsos: Callable[[SimulatorSettings], tuple[RSO, ...]]
+
+
+class _Pursuit(NamedTuple):
+    """A scene on the sphere, with a mount that may be told to follow an RSO."""
+
+    summary: str
+    settings: dict[str, Any]
+    simulator: Callable[[SimulatorSettings], SphereSimulator]
 
 
 def _standing(s: SimulatorSettings) -> tuple[RSO, ...]:
@@ -106,10 +120,62 @@ def _tumbling(s: SimulatorSettings) -> tuple[RSO, ...]:
     )
 
 
+def _pursued(
+    angle_rad: Callable[[np.ndarray], np.ndarray],
+) -> Callable[[SimulatorSettings], SphereSimulator]:
+    """One RSO on a great circle through the field, its angle along it by the time, and a mount.
+
+    It starts left behind of the image's centre, so that it passes near by it if nobody commands
+    the mount, which then tracks the stars.
+    """
+
+    def simulator(s: SimulatorSettings) -> SphereSimulator:
+        random = s.random("scenario", 3)
+        ra, dec = random.uniform(0, 2 * math.pi), math.asin(random.uniform(-0.9, 0.9))
+        turn, aside = random.uniform(0, 2 * math.pi), random.uniform(-0.1, 0.1)
+        way = np.array([math.cos(turn), math.sin(turn)])
+        start = (-0.35 * way + aside * way[::-1] * (-1, 1)) * min(s.width, s.height)
+        start += (np.array([s.width, s.height]) - 1) / 2
+        camera = Camera.ideal(s.width, s.height, math.radians(s.pixel_scale_arcsec / 3600))
+        attitude = looking_at(ra, dec)
+        first, second = attitude.inv().apply(camera.lines_of_sight(np.stack([start, start + way])))
+        pole = np.cross(first, second)
+        ahead = np.cross(pole / np.linalg.norm(pole), first)
+
+        def direction(times_s: np.ndarray) -> np.ndarray:
+            angle = angle_rad(times_s)[:, None]
+            return np.cos(angle) * first + np.sin(angle) * ahead
+
+        mount = SimulatedMount(
+            attitude,
+            max_rate_deg_s=5,
+            max_acceleration_deg_s2=2,
+            latency_s=0.05,
+            periodic_error=(8, 40),
+        )
+        return SphereSimulator(s, [Target(direction, snr=50)], mount)
+
+    return simulator
+
+
+def _drifting(times_s: np.ndarray) -> np.ndarray:
+    return np.radians(0.2) * times_s
+
+
+def _passing(times_s: np.ndarray) -> np.ndarray:
+    """Angle of a pass: 0.1 deg/s at its ends, 0.6 deg/s in its middle, the culmination."""
+    slow, fast, seconds = math.radians(0.1), math.radians(0.6), 90
+    swing = np.sin(2 * math.pi * times_s / seconds) * seconds / (2 * math.pi)
+    return slow * times_s + (fast - slow) / 2 * (times_s - swing)
+
+
+# The telescope of the guide's scenarios: quick, and with a wide field.
+_GUIDED = {"pixel_scale_arcsec": 10.0, "exposure_s": 0.05, "period_s": 0.1}
+
 # The camera of "geo": the sky turns at 15.04 arcsec/s; its x axis is 10 degrees off east-west.
 _AT_REST = {"camera_rate_arcsec_s": (14.81, 2.61), "exposure_s": 2.0, "period_s": 2.5}
 
-_SCENES = {
+_SCENES: dict[str, _Scene | _Pursuit] = {
     "geo": _Scene(
         "five stationary RSOs among streaking stars: the camera stands still on the ground",
         {**_AT_REST, "frames": 40},
@@ -208,11 +274,21 @@ _SCENES = {
         },
         _tumbling,
     ),
+    "guide_drift": _Pursuit(
+        "an RSO drifts at 0.2 deg/s across a sidereal field; the mount obeys",
+        {**_GUIDED, "frames": 300},
+        _pursued(_drifting),
+    ),
+    "guide_leo": _Pursuit(
+        "as in a LEO pass, an RSO's rate rises from 0.1 to 0.6 deg/s and falls; the mount obeys",
+        {**_GUIDED, "frames": 900},
+        _pursued(_passing),
+    ),
 }
 SCENARIOS: Mapping[str, str] = {name: scene.summary for name, scene in _SCENES.items()}
 
 
-def scenario(name: str, seed: int = 1, **overrides: Any) -> SkySimulator:
+def scenario(name: str, seed: int = 1, **overrides: Any) -> Simulator:
     """Return the simulator of a named scenario.
 
     Parameters
@@ -224,6 +300,12 @@ def scenario(name: str, seed: int = 1, **overrides: Any) -> SkySimulator:
     **overrides
         Values of `SimulatorSettings` that differ from the scenario's.  Unless given, ``rsos``
         and ``star_count`` fit themselves to the size, rates and number of frames.
+
+    Returns
+    -------
+    SkySimulator or SphereSimulator
+        Of the two, the latter for a scenario whose name begins with ``guide``: its `motion` is a
+        `SimulatedMount` that tracks the stars until it is commanded.
 
     Raises
     ------
@@ -240,8 +322,8 @@ def scenario(name: str, seed: int = 1, **overrides: Any) -> SkySimulator:
             raise ParameterError(f"there is no setting {key!r} of the simulator{hint}")
     scene = _SCENES[name]
     settings = SimulatorSettings(**{**scene.settings, **overrides, "seed": seed})
-    fitted = {
-        "star_count": _STARS_PER_PX * settings.width * settings.height,
-        "rsos": scene.rsos(settings),
-    }
-    return SkySimulator(dataclasses.replace(settings, **{**fitted, **overrides}))
+    fitted: dict[str, Any] = {"star_count": _STARS_PER_PX * settings.width * settings.height}
+    if isinstance(scene, _Scene):
+        fitted["rsos"] = scene.rsos(settings)
+    settings = dataclasses.replace(settings, **{**fitted, **overrides})
+    return SkySimulator(settings) if isinstance(scene, _Scene) else scene.simulator(settings)

@@ -21,7 +21,8 @@ _PURPOSES = (
 Pair = tuple[float, float]
 
 
-def _check_number(name: str, value: Any, low: float, high: float, integer: bool) -> Any:
+def check_number(name: str, value: Any, low: float, high: float, integer: bool = False) -> Any:
+    """Return `value` as a float, or an int, or raise `ParameterError` if it is out of range."""
     kind = int | np.integer if integer else int | float | np.integer | np.floating
     if isinstance(value, bool) or not isinstance(value, kind) or not low <= value <= high:
         word = "an integer" if integer else "a number"
@@ -33,7 +34,7 @@ def check_pair(name: str, value: Any, low: float, high: float) -> Pair:
     """Return `value` as two floats, or raise `ParameterError` if it is not two in the range."""
     if isinstance(value, str) or not isinstance(value, Iterable) or len(pair := (*value,)) != 2:
         raise ParameterError(f"{name} must be a pair of numbers, not {value!r}")
-    first, second = (_check_number(name, number, low, high, False) for number in pair)
+    first, second = (check_number(name, number, low, high) for number in pair)
     return first, second
 
 
@@ -76,7 +77,7 @@ class RSO:
                 object.__setattr__(self, name, check_pair(name, value, -limit, limit))
         for name, (low, high) in _RSO_RANGES.items():
             if (value := getattr(self, name)) is not None:
-                object.__setattr__(self, name, _check_number(name, value, low, high, False))
+                object.__setattr__(self, name, check_number(name, value, low, high))
         if self.flux_percent is not None and self.snr is not None:
             raise ParameterError(
                 f"an RSO has a flux_percent ({self.flux_percent:g}) or an snr ({self.snr:g}),"
@@ -213,7 +214,7 @@ class SimulatorSettings:
             if isinstance(default, tuple):
                 value = check_pair(name, value, low, high)
             else:
-                value = _check_number(name, value, low, high, isinstance(default, int))
+                value = check_number(name, value, low, high, isinstance(default, int))
             object.__setattr__(self, name, value)
         for name in _LEAST_AND_GREATEST:
             low, high = getattr(self, name)
