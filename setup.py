@@ -24,18 +24,20 @@ ROS = [
     *OPENCV,
 ]
 LINT = ["mypy>=2.4,<3", "ruff>=0.17,<0.18", "types-PyYAML", "types-tqdm"]
-BENCH = ["matplotlib"]
+SKY = ["astropy"]
+BENCH = ["matplotlib", "sgp4", *SKY]
 TEST = [
     "colcon-core",
     "colcon-ros",
     "hypothesis",
     "pytest>=9",
     "sep",
+    *("ccsds-ndm", "lxml"),  # reads back what we write; GPL, so for tests only
     "setuptools>=70.1,<80",  # the range in which colcon and pip can both build with it
 ]
 
 SAMPLE_BAG = "bags/survey_png"  # the smallest
-NODES = ("detector", "player", "simulator", "recorder", "demo")
+NODES = ("detector", "player", "simulator", "recorder", "guide", "tdm_writer", "demo")
 
 setup(
     name=NAME,
@@ -61,10 +63,11 @@ setup(
     extras_require={
         "ros": ROS,
         "opencv": OPENCV,
+        "sky": SKY,
         "lint": LINT,
         "test": TEST,
         "bench": BENCH,
-        "all": [*ROS, *LINT, *TEST, *BENCH],
+        "all": [*ROS, *SKY, *LINT, *TEST, *BENCH],
     },
     entry_points={
         "console_scripts": [

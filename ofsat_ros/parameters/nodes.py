@@ -95,6 +95,15 @@ class SimulatorParameters(Table):
         1.0, 0.01, 1000.0, "", "simulator", "speed against the scenario's own clock", live=False
     )
     loop: bool = plain(True, "simulator", "render on beyond the scenario's last frame", live=False)
+    mount_timeout_s: float = number(
+        1.0,
+        0.01,
+        3600.0,
+        "s",
+        "simulator",
+        "a mount stops by itself when the last mount_rate is so old, on the scenario's clock",
+        live=False,
+    )
 
 
 @dataclass(frozen=True)
@@ -231,7 +240,11 @@ class GuideParameters(Table):
 class TrackingDataParameters(Table):
     """What the tdm_writer node and ``ofsat process --tdm`` say in their files."""
 
-    station: str = plain("OFSAT", "tracking_data", "name of the station: PARTICIPANT_1")
+    station: str = plain(
+        "OFSAT",
+        "tracking_data",
+        "name of the station: PARTICIPANT_1; for format iod its four digits",
+    )
     originator: str = plain("OFSAT_ROS", "tracking_data", "who makes the message: ORIGINATOR")
     object_names: str = plain(
         "",

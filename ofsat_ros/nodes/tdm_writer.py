@@ -1,0 +1,255 @@
+"""The tdm_writer node: each track's directions as a file, once the track has ended.
+
+Stands after the detector, beside whatever determines orbits, and writes what ``tracking_data``
+makes: CCSDS TDM as text or XML, or IOD lines.  It takes ``rso_detections`` and, on purpose, not
+``rso_tracks``: those are measurements, each with its own error, while the places of a track are
+filtered, and so lean on each other and go on where nothing was seen; an orbit fitted to them
+would be off, and believe itself better than it is.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from collections import Counter
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.clock import Clock, ClockType
+from rclpy.context import Context
+from rclpy.node import Node
+from sensor_msgs.msg import PointCloud2
+
+from ofsat_ros.camera import Astrometry
+from ofsat_ros.nodes import messages
+from ofsat_ros.nodes.ros_parameters import NodeParameters
+from ofsat_ros.nodes.runtime import StartError, overridable_qos, parser_of, reliable, run
+from ofsat_ros.parameters import (
+    CameraParameters,
+    ParameterError,
+    Table,
+    TdmWriterParameters,
+    TrackingDataParameters,
+)
+from ofsat_ros.tracking_data import SUFFIXES, Arc, TrackArcs, write_arcs
+
+_DEPTH = 1000  # detections of so many frames may wait while a file is written
+_WARN_EVERY_S = 10.0
+_RETRY_S = 10.0
+_NO_DIRECTIONS = (
+    "the detections have no right ascension and declination, so that there is nothing to write:"
+    " the detector needs a calibration on camera_info and a fresh attitude, and its own"
+    " diagnostics say what is missing"
+)
+
+
+class TdmWriter(Node):
+    """Collects directions and writes a file for every track that has ended.
+
+    Parameters
+    ----------
+    stop : threading.Event
+        Not used: the node works until it is stopped.
+    context : Context, optional
+        ROS context; default: the process's.
+
+    Attributes
+    ----------
+    exit_code : int
+        1 if some track could not be written to the end, else 0.
+
+    Raises
+    ------
+    ofsat_ros.parameters.ParameterError
+        If a start parameter is bad, or does not do for the format.
+    StartError
+        If the output folder cannot be made or written.
+    """
+
+    def __init__(self, stop: threading.Event, context: Context | None = None) -> None:
+        super().__init__("tdm_writer", context=context)
+        self.exit_code = 0
+        self._settings = NodeParameters(
+            self,
+            CameraParameters(),
+            TrackingDataParameters(),
+            TdmWriterParameters(),
+            changed=self._on_change,
+        )
+        own = self._settings[TdmWriterParameters]
+        self._format, self._ended_after_s = own.format, own.ended_after_s
+        self._astrometry = Astrometry(self._settings[CameraParameters])
+        self._arcs = TrackArcs(self._settings[TrackingDataParameters], [own.format])
+        self._folder = Path(own.output or datetime.now(UTC).strftime("tracks_%Y%m%d_%H%M%S"))
+        _claim(self._folder)
+        self._waiting: list[Arc] = []  # ended, and not yet written
+        self._counts: Counter[str] = Counter()
+        self._why_waiting = ""
+        # Callbacks and close() come from two threads.
+        self._lock = threading.Lock()
+        self._closed = False
+        subscription = self.create_subscription(
+            PointCloud2,
+            "rso_detections",
+            self._on_detections,
+            reliable(_DEPTH),
+            qos_overriding_options=overridable_qos(),
+        )
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(1.0, self._publish_diagnostics, clock=steady)
+        self.create_timer(_RETRY_S, self._try_again, clock=steady)
+        self.get_logger().info(
+            f"writing the tracks of {subscription.topic_name} into {self._folder}"
+        )
+
+    def close(self) -> None:
+        """Write what is still open, and say what there is."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            self._waiting += self._arcs.take_all()
+            self._write_waiting()
+            if self._waiting:
+                self.exit_code = 1
+                sys.stderr.write(
+                    f"tdm_writer: {_in_words(len(self._waiting))} lost: {self._why_waiting}\n"
+                )
+            elif self._only_without_direction():
+                sys.stderr.write(f"tdm_writer: {_NO_DIRECTIONS}\n")
+            _say(f"{_in_words(self._counts['tracks'])} written into {self._folder}")
+
+    def _on_change(self, table: Table) -> None:
+        with self._lock:
+            if isinstance(table, CameraParameters):
+                self._astrometry.parameters = table
+            elif isinstance(table, TrackingDataParameters):
+                self._arcs.parameters = table
+            elif isinstance(table, TdmWriterParameters):
+                self._ended_after_s = table.ended_after_s
+
+    def _on_detections(self, cloud: PointCloud2) -> None:
+        try:
+            rows = messages.detections_array(cloud)
+        except messages.MessageError as error:
+            self.get_logger().warning(
+                f"a message is left out, which is not a detector's: {error}",
+                throttle_duration_sec=_WARN_EVERY_S,
+            )
+            return
+        with self._lock:
+            if self._closed:
+                return
+            self._count(rows)
+            stamp_ns = self._astrometry.middle_ns(messages.stamp_ns(cloud.header.stamp))
+            self._arcs.add(stamp_ns, rows)
+            ended = self._arcs.take_ended(self._ended_after_s)
+            self._waiting += ended
+            if ended:
+                self._write_waiting()
+
+    def _count(self, rows: np.ndarray) -> None:
+        of_tracks = rows[rows["track_id"] > 0]
+        known = np.isfinite(of_tracks["ra"]) & np.isfinite(of_tracks["dec"])
+        self._counts["detections"] += len(of_tracks)
+        self._counts["without_direction"] += int((~known).sum())
+        if self._only_without_direction():
+            self.get_logger().warning(_NO_DIRECTIONS, once=True)
+
+    def _only_without_direction(self) -> bool:
+        return 0 < self._counts["detections"] == self._counts["without_direction"]
+
+    def _try_again(self) -> None:
+        with self._lock:
+            if not self._closed:
+                self._write_waiting()
+
+    def _write_waiting(self) -> None:
+        """Write what has ended; keep what cannot be written, and say why, once."""
+        while self._waiting:
+            arc = self._waiting[0]
+            path = _free(self._folder, arc, SUFFIXES[self._format])
+            try:
+                write_arcs(path, [arc], self._format, self._arcs.parameters)
+            except (OSError, ParameterError) as error:
+                why = f"{path} cannot be written: {getattr(error, 'strerror', None) or error}"
+                if not self._why_waiting:
+                    self.get_logger().error(f"{why}; its track is kept and tried again")
+                self._why_waiting = why
+                return
+            del self._waiting[0]
+            self._why_waiting = ""
+            self._counts["tracks"] += 1
+            _say(f"{path}: {len(arc.rows)} directions of track {arc.label}")
+
+    def _publish_diagnostics(self) -> None:
+        with self._lock:
+            counts, waiting, why = self._counts.copy(), len(self._waiting), self._why_waiting
+            problems = [f"{_in_words(waiting)} waiting: {why}"] if waiting else []
+            if self._only_without_direction():
+                problems.append(_NO_DIRECTIONS)
+        values = {
+            "tracks_written": counts["tracks"],
+            "tracks_waiting": waiting,
+            "detections": counts["detections"],
+            "detections_without_direction": counts["without_direction"],
+            "folder": self._folder,
+        }
+        status = messages.diagnostic(
+            f"{self.get_fully_qualified_name()}: tracking data",
+            problems,
+            f"{_in_words(counts['tracks'])} written",
+            values,
+        )
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(array)
+
+
+def _claim(folder: Path) -> None:
+    """Make the folder; what it holds is never touched."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StartError(
+            f"{folder} cannot be made: {error.strerror}; choose another folder with"
+            " -p output:=FOLDER"
+        ) from error
+    if not os.access(folder, os.W_OK):
+        raise StartError(f"{folder} cannot be written; choose another with -p output:=FOLDER")
+
+
+def _free(folder: Path, arc: Arc, suffix: str) -> Path:
+    """A name for an arc's file that no file has."""
+    first = datetime.fromtimestamp(arc.first_ns // 1_000_000_000, UTC)
+    stem = f"{first:%Y%m%dT%H%M%S}_{arc.label}"
+    path, number = folder / (stem + suffix), 1
+    while path.exists():
+        number += 1
+        path = folder / f"{stem}_{number}{suffix}"
+    return path
+
+
+def _in_words(tracks: int) -> str:
+    return f"{tracks} track{'s' * (tracks != 1)}"
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+def main() -> int:
+    """Run the node; return the exit code."""
+    return run(
+        lambda stop, options: TdmWriter(stop),
+        parser_of("tdm_writer", "Write the directions of tracks for orbit determination."),
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
