@@ -30,6 +30,12 @@ ARGUMENTS = [
         "image", default_value="", description="topic to read; empty: image, or image/compressed"
     ),
     DeclareLaunchArgument(
+        "camera_info", default_value="", description="topic of the calibration; empty: camera_info"
+    ),
+    DeclareLaunchArgument(
+        "attitude", default_value="", description="topic of the attitude; empty: attitude"
+    ),
+    DeclareLaunchArgument(
         "image_transport",
         default_value="",
         choices=["", "raw", "compressed"],
@@ -63,7 +69,9 @@ def detector(context: LaunchContext) -> list[Node]:
     if given["reliable_input"]:
         parameters["reliable_input"] = given["reliable_input"] == "true"
     files = [given["params_file"]] if given["params_file"] else []
-    names = ("image", "image/compressed") if given["image"] else ()
+    remappings = [(name, given[name]) for name in ("camera_info", "attitude") if given[name]]
+    if given["image"]:
+        remappings += [(name, given["image"]) for name in ("image", "image/compressed")]
     return [
         Node(
             package="ofsat_ros",
@@ -72,7 +80,7 @@ def detector(context: LaunchContext) -> list[Node]:
             namespace=given["namespace"],
             output="screen",
             parameters=[*files, parameters],
-            remappings=[(name, given["image"]) for name in names],
+            remappings=remappings,
         )
     ]
 

@@ -31,6 +31,10 @@ def replay(context: LaunchContext) -> list:
     )
     with open_recording(bag, topic or None) as recording:
         topic = recording.topic
+        beside = {
+            "camera_info": recording.camera_info_topic,
+            "attitude": recording.attitude_topic,
+        }
     with Bag(bag) as messages:
         compressed = messages.topics[topic].msgtype == COMPRESSED_IMAGE
     detector = IncludeLaunchDescription(
@@ -39,6 +43,7 @@ def replay(context: LaunchContext) -> list:
             "image": topic,
             "image_transport": "compressed" if compressed else "raw",
             "reliable_input": "true",
+            **{name: found for name, found in beside.items() if found},
         }.items(),
     )
     player = Node(

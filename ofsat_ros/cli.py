@@ -10,20 +10,16 @@ from __future__ import annotations
 
 import json
 import sys
-import time
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NoReturn
 
 import click
-import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from ofsat_ros import __version__
+from ofsat_ros.camera import Astrometry
 from ofsat_ros.evaluation import (
     EvaluationError,
     count_frames,
@@ -35,18 +31,23 @@ from ofsat_ros.evaluation import (
 )
 from ofsat_ros.parameters import (
     DEFAULT_PRESET,
+    CameraParameters,
     Description,
     ParameterError,
     Parameters,
+    Table,
+    TrackingDataParameters,
     preset_names,
 )
-from ofsat_ros.pipeline import ImageError, Pipeline
-from ofsat_ros.recordings import BagWriter, Recording, RecordingError, open_recording
-from ofsat_ros.results import DETECTIONS, STAR_FIELD, TRACKS, ResultWriter, in_words
+from ofsat_ros.pipeline import Pipeline
+from ofsat_ros.processing import Processing
+from ofsat_ros.recordings import BagWriter, RecordingError, open_recording
+from ofsat_ros.results import DETECTIONS, STAR_FIELD, TRACKS, ResultWriter
 from ofsat_ros.simulation import SCENARIOS, scenario, write_truth
-from ofsat_ros.tracking import Settled
+from ofsat_ros.tracking_data import TRACKING_DATA, TrackArcs
 
 IMAGE_TOPIC = "/camera/image_raw"
+CAMERA_INFO_TOPIC, ATTITUDE_TOPIC = "/camera/camera_info", "/camera/attitude"
 FRAME_ID = "camera_optical_frame"
 
 
@@ -57,8 +58,9 @@ def main() -> None:
 
 
 def _parameter_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add an option for each pipeline parameter, from the table."""
-    for about in reversed(list(Parameters.describe())):
+    """Add an option for each parameter of a recording's processing, from the tables."""
+    tables = (Parameters, CameraParameters, TrackingDataParameters)
+    for about in reversed([about for table in tables for about in table.describe()]):
         allowed = f"{about.allowed} {about.unit}".strip()
         option = click.option(
             f"--{about.name.replace('_', '-')}",
@@ -84,6 +86,16 @@ def _option_type(about: Description) -> Any:
     help=f"folder for {DETECTIONS}, {TRACKS} and {STAR_FIELD}",
 )
 @click.option("--topic", help="image topic, if the recording holds several")
+@click.option("--camera-info-topic", help="topic of the calibration, if there are several")
+@click.option("--attitude-topic", help="topic of the camera's attitude, if there are several")
+@click.option(
+    "--tdm",
+    "formats",
+    multiple=True,
+    type=click.Choice(list(TRACKING_DATA)),
+    help="also write the tracks' right ascensions and declinations: a CCSDS TDM as text (kvn) or"
+    " XML, or IOD lines as on SeeSat-L; may be given several times",
+)
 @click.option("--preset", default=DEFAULT_PRESET, type=click.Choice(preset_names()))
 @click.option(
     "--live",
@@ -98,6 +110,9 @@ def process(
     recording: Path,
     output: Path,
     topic: str | None,
+    camera_info_topic: str | None,
+    attitude_topic: str | None,
+    formats: tuple[str, ...],
     preset: str,
     live: bool,
     force: bool,
@@ -107,16 +122,27 @@ def process(
     """Detect RSOs in RECORDING: a rosbag2 folder, a bare .mcap or .db3 file, or a ROS 1 bag."""
     try:
         given = {name: value for name, value in changes.items() if value is not None}
-        parameters = Parameters.preset(preset, **given)
+        parameters = Parameters.preset(preset, **_of(Parameters, given))
+        astrometry = Astrometry(CameraParameters.of(_of(CameraParameters, given)))
+        about = TrackingDataParameters.of(_of(TrackingDataParameters, given))
+        arcs = TrackArcs(about, formats) if formats else None
     except ParameterError as error:
         raise click.UsageError(str(error)) from error
-    totals = _Totals()
+    processing = Processing(Pipeline(parameters), astrometry, arcs, live, _say)
+    totals = processing.totals
+    made = [DETECTIONS, TRACKS, STAR_FIELD]
     try:
         with ExitStack() as stack:
-            frames = stack.enter_context(open_recording(recording, topic))
-            _claim(output, force)
+            frames = stack.enter_context(
+                open_recording(recording, topic, camera_info_topic, attitude_topic)
+            )
+            _claim(output, [*made, *(TRACKING_DATA[name] for name in formats)], force)
             writer = stack.enter_context(ResultWriter(output))
-            _process(frames, Pipeline(parameters), writer, totals, live)
+            try:
+                processing.run(frames, writer)
+            finally:
+                # Also when stopped: whole, with what was done.
+                made += _write_arcs(arcs, output, formats)
     except (RecordingError, OSError) as error:
         _fail(error)
     except KeyboardInterrupt:
@@ -124,105 +150,9 @@ def process(
         sys.exit(130)
     if not totals.frames:
         _fail(f"no frame of {recording} could be processed")
-    click.echo(f"{totals}; {DETECTIONS}, {TRACKS} and {STAR_FIELD} are in {output}")
+    click.echo(f"{totals}; {', '.join(made[:-1])} and {made[-1]} are in {output}")
     if profile:
         click.echo(totals.profile())
-
-
-class _Totals:
-    """Counts and times for the summary."""
-
-    def __init__(self) -> None:
-        self.frames = self.left_out = 0
-        self.detections: Counter[int] = Counter()
-        self.reason = ""
-        self.reading_s = 0.0  # in its own thread, beside all others
-        self._seconds: dict[str, float] = defaultdict(float)  # none overlap
-
-    @contextmanager
-    def timed(self, stage: str) -> Iterator[dict[str, float]]:
-        """Count the time of a stage; that of its parts, which it may be told of, apart."""
-        parts: dict[str, float] = {}
-        start_s = time.perf_counter()
-        try:
-            yield parts
-        finally:
-            taken_s = time.perf_counter() - start_s
-            for part, seconds in (*parts.items(), (stage, taken_s - sum(parts.values()))):
-                self._seconds[part] += seconds
-
-    def profile(self) -> str:
-        """Return a table of where the time went."""
-        frames, whole_s = max(self.frames, 1), sum(self._seconds.values())
-        lines = [f"{'stage':<26}{'ms per frame':>12}{'share':>8}"]
-        rows = sorted(self._seconds.items(), key=lambda row: -row[1])
-        rows += [("all", whole_s), ("reading, meanwhile", self.reading_s)]
-        for stage, seconds in rows:
-            name, share = stage.replace("_", " "), f"{seconds / whole_s:.1%}"
-            lines.append(f"{name:<26}{1e3 * seconds / frames:>12.2f}{share:>8}")
-        return "\n".join(lines)
-
-    def __str__(self) -> str:
-        words = f"{in_words(self.detections)} in {self.frames} frames"
-        if self.left_out:
-            words += f" ({self.left_out} more could not be processed)"
-        if not self.detections and self.reason:
-            words += f"; the last frame says: {self.reason}"
-        return words
-
-
-def _process(
-    frames: Recording, pipeline: Pipeline, writer: ResultWriter, totals: _Totals, live: bool
-) -> None:
-    refused = 0
-    # Numbers in the recording, which count those that could not be decoded, by the pipeline's.
-    numbers: dict[int, int] = {}
-
-    def write(stamp_ns: int, frame: int, detections: NDArray[np.void]) -> None:
-        writer.add_detections(stamp_ns, frame, detections)
-        totals.detections.update(detections["track_id"].tolist())
-
-    def write_settled(settled: list[Settled]) -> None:
-        for last in settled:
-            number = numbers.pop(last.frame)
-            if not live:
-                write(last.stamp_ns, number, last.detections)
-
-    coming = iter(tqdm(frames, unit=" frames", dynamic_ncols=True, disable=None))
-    try:
-        while True:
-            with totals.timed("waiting for frames"):
-                frame = next(coming, None)
-            if frame is None:
-                break
-            number = frame.number
-            try:
-                with totals.timed("other") as stages:
-                    result = pipeline.process(frame.image, frame.stamp_ns)
-                    stages |= result.seconds
-            except ImageError as error:
-                refused += 1
-                if refused == 1:
-                    _say(f"note: frame {number} is left out, and others like it: {error}")
-                continue
-            if result.reset and totals.frames:
-                _say(f"note: frame {number} starts afresh: {result.reset}")
-            numbers[result.frame] = number
-            with totals.timed("writing"):
-                writer.add_star_field(replace(result, frame=number))
-                if live:
-                    write(result.stamp_ns, number, result.detections)
-                write_settled(result.settled)
-            totals.frames += 1
-            totals.reason = result.reason
-    finally:
-        # Also when stopped or torn off: what was seen is not lost.
-        with totals.timed("the last frames' last word"):
-            write_settled(pipeline.finish())
-        totals.reading_s = frames.seconds
-    totals.left_out = refused + frames.skipped
-    for problem in frames.problems:
-        _say(f"note: {problem}")
 
 
 @main.command()
@@ -303,9 +233,10 @@ def simulate(
     try:
         with BagWriter(output, storage=storage, compression="none", force=force) as bag:
             for frame in tqdm(sky, total=len(sky), unit=" frames", disable=None):
-                bag.write_image(
-                    topic, frame.image, frame.stamp_ns, FRAME_ID, compressed=compressed
-                )
+                stamp_ns = frame.stamp_ns
+                bag.write_camera_info(CAMERA_INFO_TOPIC, sky.camera, stamp_ns, FRAME_ID)
+                bag.write_attitude(ATTITUDE_TOPIC, frame.attitude, stamp_ns, FRAME_ID)
+                bag.write_image(topic, frame.image, stamp_ns, FRAME_ID, compressed=compressed)
                 rows.append(frame.truth)
         write_truth(truth, rows)
     except (RecordingError, OSError) as error:
@@ -317,10 +248,27 @@ def simulate(
     click.echo(f"{len(rows)} frames on {topic} are in {output}, their truth in {truth}")
 
 
-def _claim(folder: Path, force: bool) -> None:
+def _write_arcs(arcs: TrackArcs | None, output: Path, formats: tuple[str, ...]) -> list[str]:
+    """Write the tracks' directions, and return the files' names; say so if there are none."""
+    if arcs is None:
+        return []
+    made = [name for name in formats if arcs.write(output / TRACKING_DATA[name], name, force=True)]
+    if not made:
+        least = arcs.parameters.least_detections
+        _say(f"note: no tracking data is written: no track has ra and dec in {least} frames")
+    return [TRACKING_DATA[name] for name in made]
+
+
+def _of(table: type[Table], given: dict[str, Any]) -> dict[str, Any]:
+    """Return those of the given values that are a table's."""
+    names = {about.name for about in table.describe()}
+    return {name: value for name, value in given.items() if name in names}
+
+
+def _claim(folder: Path, files: list[str], force: bool) -> None:
     """Make the folder for the results, or refuse to overwrite those that it holds."""
     folder.mkdir(parents=True, exist_ok=True)
-    old = [name for name in (DETECTIONS, TRACKS, STAR_FIELD) if (folder / name).exists()]
+    old = [name for name in files if (folder / name).exists()]
     if old and not force:
         raise RecordingError(
             f"{folder} already holds {', '.join(old)}; choose another folder, or --force to"

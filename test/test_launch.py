@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from ofsat_ros.camera import Camera
 from ofsat_ros.nodes.recorder import HEARING
 from ofsat_ros.parameters import (
     DetectorParameters,
@@ -94,6 +96,8 @@ def test_detector_takes_its_arguments(launch: Any):
             "detector.launch.py",
             namespace="east",
             image="/cam/image_raw",
+            camera_info="/cam/camera_info",
+            attitude="/mount/attitude",
             image_transport="compressed",
             preset="paper_opencv",
             reliable_input="false",
@@ -111,6 +115,8 @@ def test_detector_takes_its_arguments(launch: Any):
     }
     DetectorParameters.of(parameters)
     assert node.kwargs["remappings"] == [
+        ("camera_info", "/cam/camera_info"),
+        ("attitude", "/mount/attitude"),
         ("image", "/cam/image_raw"),
         ("image/compressed", "/cam/image_raw"),
     ]
@@ -188,6 +194,18 @@ def test_replay_joins_player_and_detector_at_the_image_topic(
     assert only("Node", launch("detector.launch.py", **arguments))
 
     assert only("OnProcessExit", [asked[-1].args[0]]).kwargs["target_action"] is player
+
+
+def test_replay_joins_calibration_and_attitude_too(launch: Any, tmp_path: Path):
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.write_image("/cam/image_raw", np.zeros((16, 16), np.uint8), 1, "cam")
+        bag.write_camera_info("/cam/camera_info", Camera.ideal(16, 16, 1e-4), 1, "cam")
+        bag.write_attitude("/mount/attitude", Rotation.identity(), 1, "cam")
+    asked = launch("replay.launch.py", bag=f"{tmp_path / 'bag'}")
+    arguments = dict(only("IncludeLaunchDescription", asked).kwargs["launch_arguments"])
+    assert arguments["camera_info"] == "/cam/camera_info"
+    assert arguments["attitude"] == "/mount/attitude"
+    assert only("Node", launch("detector.launch.py", **arguments))
 
 
 def test_replay_says_which_image_topics_there_are(launch: Any, tmp_path: Path):

@@ -21,12 +21,22 @@ from ofsat_ros.tracking import COASTING, TRACK_DTYPE
 HEADER = Header(stamp=messages.time_message(1_700_000_000_123_456_789), frame_id="optical")
 
 
+# Columns of DETECTION_DTYPE that no message has.
+NOT_CARRIED = {"significance"}
+
+
+def unit_vectors(count: int, random: np.random.Generator) -> np.ndarray:
+    vectors = random.standard_normal((count, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
 def detections(count: int = 3, seed: int = 0) -> np.ndarray:
     random = np.random.default_rng(seed)
     rows = np.zeros(count, DETECTION_DTYPE)
     for name in DETECTION_DTYPE.names:
         if DETECTION_DTYPE[name].kind == "f":
             rows[name] = random.uniform(1, 100, count)
+    rows["sight"] = unit_vectors(count, random)
     rows["track_id"], rows["status"] = 1 + np.arange(count), CONFIRMED
     rows["object_index"] = rows["flow_index"] = -1
     return rows
@@ -38,6 +48,7 @@ def tracks(*statuses: int) -> np.ndarray:
     for name in TRACK_DTYPE.names:
         if TRACK_DTYPE[name].kind == "f":
             rows[name] = random.uniform(1, 100, len(rows))
+    rows["sight"] = unit_vectors(len(rows), random)
     rows["track_id"], rows["status"] = 4_000_000_000 + np.arange(len(rows)), statuses
     rows["hits"], rows["misses"] = 5 + np.arange(len(rows)), np.arange(len(rows))
     return rows
@@ -161,14 +172,25 @@ def test_an_image_that_is_too_short_is_an_encoding_error():
 )
 def test_cloud_has_the_fields_of_the_design(cloud, more):
     doubles = "u v u_rate v_rate rel_u_rate rel_v_rate sigma_u sigma_v snr flux length angle"
-    expected = dict.fromkeys(doubles.split() + ["ra", "dec"], PointField.FLOAT64)
+    doubles += " ra dec sigma_ra sigma_dec"
+    expected = dict.fromkeys(doubles.split(), PointField.FLOAT64)
     expected |= dict.fromkeys("xyz", PointField.FLOAT32)
     expected |= {"id": PointField.UINT32, "status": PointField.UINT8, **more}
     assert {f.name: f.datatype for f in cloud.fields} == expected
     assert {f.count for f in cloud.fields} == {1}
     assert (cloud.height, cloud.width) == (1, 2)
     assert cloud.row_step == 2 * cloud.point_step == len(cloud.data)
-    assert not cloud.is_dense  # the lines of sight are unknown
+    assert cloud.is_dense
+
+
+def test_a_cloud_without_lines_of_sight_is_not_dense():
+    rows = detections(2)
+    rows["sight"][1] = np.nan
+    cloud = messages.detections_cloud(HEADER, rows)
+    assert not cloud.is_dense
+    axes = messages.cloud_array(cloud)[list("xyz")].tolist()
+    assert axes[0] == pytest.approx(rows["sight"][0], abs=1e-7)
+    assert np.isnan(axes[1]).all()
 
 
 def test_cloud_holds_the_detections():
@@ -182,16 +204,19 @@ def test_cloud_holds_the_detections():
         np.testing.assert_array_equal(back[field], rows[column])
     for name in ("snr", "flux", "length", "angle", "status"):
         np.testing.assert_array_equal(back[name], rows[name])
-    for name in ("x", "y", "z"):
-        assert np.isnan(back[name]).all()
+    for axis, name in enumerate("xyz"):  # FLOAT32
+        np.testing.assert_array_equal(back[name], rows["sight"][:, axis].astype("f4"))
 
 
 def test_detections_come_back_from_a_cloud():
     rows = detections(4)
     back = messages.detections_array(messages.detections_cloud(HEADER, rows))
-    for name in set(DETECTION_DTYPE.names) - {"significance", "object_index", "flow_index"}:
+    carried = set(DETECTION_DTYPE.names) - NOT_CARRIED - {"object_index", "flow_index"}
+    for name in carried - {"sight"}:
         np.testing.assert_array_equal(back[name], rows[name])
-    assert np.isnan(back["significance"]).all()  # what is not carried is unknown, not 0
+    np.testing.assert_allclose(back["sight"], rows["sight"], atol=1e-7)
+    for name in NOT_CARRIED:
+        assert np.isnan(back[name]).all()  # what is not carried is unknown, not 0
     assert (back["object_index"] == -1).all()
     assert (back["flow_index"] == -1).all()
 
@@ -207,14 +232,17 @@ def test_cloud_holds_the_tracks_and_they_come_back():
         np.testing.assert_array_equal(heard[field], rows[column])
     for name in ("snr", "age", "hits", "misses", "status"):
         np.testing.assert_array_equal(heard[name], rows[name])
-    for name in "xyz":
-        assert np.isnan(heard[name]).all()
+    for axis, name in enumerate("xyz"):
+        np.testing.assert_array_equal(heard[name], rows["sight"][:, axis].astype("f4"))
 
     back = messages.tracks_array(cloud)
     assert back.dtype == TRACK_DTYPE
-    for name in set(TRACK_DTYPE.names) - {"log_false"}:
+    unknown = {"log_false"}
+    for name in set(TRACK_DTYPE.names) - unknown - {"sight"}:
         np.testing.assert_array_equal(back[name], rows[name])
-    assert np.isnan(back["log_false"]).all()
+    np.testing.assert_allclose(back["sight"], rows["sight"], atol=1e-7)
+    for name in unknown:
+        assert np.isnan(back[name]).all()
 
 
 def test_what_reads_detections_reads_tracks_too_but_not_the_other_way():

@@ -346,7 +346,7 @@ def test_diagnostics_say_where_the_time_goes():
         station.send(*map(image, frames))
         told = values(station.diagnostics_when(lambda s: values(s)["frames_processed"] == "4"))
     profile = {k[8:-3]: float(v) for k, v in told.items() if k.startswith("profile_")}
-    steps = {"receive", "wait", "convert", "process", "publish", "draw"}
+    steps = {"receive", "wait", "convert", "process", "locate", "publish", "draw"}
     assert profile.keys() == steps | stages.keys()
     assert 0 < sum(profile[stage] for stage in stages) <= profile["process"] * 1.001  # 4 digits
     assert np.isnan(profile["draw"])

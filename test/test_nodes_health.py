@@ -229,3 +229,16 @@ def test_it_may_be_read_while_frames_are_answered():
         ended.set()
         worker.join()
         sys.setswitchinterval(usual_s)
+
+
+def test_unknown_directions_are_a_problem_only_if_they_were_known(clock):
+    one = health()
+    one.processed(FrameResult(0, 0, (10, 10)), 0.1, {"process": 0.1})
+    one.directions = ("no attitude has come", False)
+    assert problems(one) == []
+    assert one.values()["directions"] == "no attitude has come"
+    one.directions = ("the newest attitude is too old", True)
+    assert problems(one) == ["directions are unknown: the newest attitude is too old"]
+    one.directions = ("", False)
+    assert problems(one) == []
+    assert one.values()["directions"] == "known"

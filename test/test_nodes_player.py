@@ -7,12 +7,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import QuaternionStamped
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParametersAtomically
 from ros_graph import Graph, Process, sky, stamps, write_bag
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import CompressedImage, Image, PointCloud2
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
+from ofsat_ros.camera import Camera
 from ofsat_ros.images import decode_message
 from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.player import Player
@@ -117,6 +120,28 @@ def test_topic_is_chosen_and_compressed_images_go_out_as_they_are(tmp_path, stop
         graph.until(stop.is_set)
     assert left == []
     np.testing.assert_array_equal(decode_message(right[3]), FRAMES[3].image)
+
+
+def test_calibration_and_attitude_go_out_in_the_recorded_order(tmp_path, stop):
+    camera = Camera.ideal(16, 16, 1e-4)
+    with BagWriter(tmp_path / "bag") as writer:
+        for number in range(3):
+            at_ns = TIMES[number]
+            writer.write_camera_info("/cam/camera_info", camera, at_ns, "cam")
+            writer.write_attitude("/mount/attitude", Rotation.identity(), at_ns + 1, "cam")
+            writer.write_image("/cam/image", np.zeros((16, 16), np.uint8), at_ns + 2, "cam")
+    order = []
+    with Graph("-p", "rate:=20.0") as graph:
+        graph.add(Player(stop, f"{tmp_path / 'bag'}", context=graph.context))
+        infos = graph.listen(CameraInfo, "/cam/camera_info")
+        attitudes = graph.listen(QuaternionStamped, "/mount/attitude")
+        images = graph.listen(Image, "/cam/image")
+        graph.until(lambda: len(infos) == len(attitudes) == len(images) == 3)
+    for number in range(3):
+        order += [stamps(one)[number] for one in (infos, attitudes, images)]
+    assert order == [at_ns + i for at_ns in TIMES[:3] for i in range(3)]
+    np.testing.assert_array_equal(infos[0].k, camera.matrix.ravel())
+    assert attitudes[0].quaternion.w == 1.0
 
 
 def test_replay_waits_for_the_answers_of_a_detector(bag, stop):

@@ -8,7 +8,9 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.rosbag2 import Reader as Rosbag2Reader
 from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
 
+from ofsat_ros.camera import Camera
 from ofsat_ros.images import encode_png
 from ofsat_ros.recordings import (
     COMPRESSED_IMAGE,
@@ -728,3 +730,132 @@ def test_a_place_that_cannot_be_written_is_an_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(RecordingError, match="cannot write"):
         BagWriter(tmp_path / "file" / "bag")
+
+
+def rotation(number):
+    return Rotation.from_rotvec([0.1, 0.02 * number, -0.3])
+
+
+def camera_of(width=30, height=20):
+    k = [2000.0, 0.0, 14.5, 0.0, 2010.0, 9.5, 0.0, 0.0, 1.0]
+    return Camera.from_calibration(width, height, k, [0.1, -0.01, 1e-3, 2e-3, 0.0], "plumb_bob")
+
+
+def calibrated_bag(path, topics=("/camera/camera_info", "/camera/attitude"), count=3):
+    """Images, with calibration and two attitudes before each, and one attitude at the end."""
+    with BagWriter(path) as bag:
+        for number in range(count):
+            stamp_ns = stamp_of(number)
+            bag.write_camera_info(topics[0], camera_of(), stamp_ns - 3, FRAME_ID)
+            for i in (2, 1):
+                bag.write_attitude(topics[1], rotation(2 * number - i), stamp_ns - i, FRAME_ID)
+            bag.write_image(TOPIC, scene(number), stamp_ns, FRAME_ID)
+        bag.write_attitude(topics[1], rotation(99), stamp_of(count), FRAME_ID)
+
+
+def test_frames_bear_calibration_and_attitudes(tmp_path):
+    calibrated_bag(tmp_path / "bag")
+    with open_recording(tmp_path / "bag") as recording:
+        frames = list(recording)
+        assert recording.problems == []
+        assert len(recording) == 3  # images
+        last = recording.last_attitudes
+    for number, frame in enumerate(frames):
+        camera, kept = frame.camera, camera_of()
+        assert (camera.width, camera.height, camera.model) == (30, 20, "plumb_bob")
+        np.testing.assert_array_equal(camera.matrix, kept.matrix)
+        np.testing.assert_array_equal(camera.distortion, kept.distortion)
+        assert [stamp for stamp, _ in frame.attitudes] == [stamp_of(number) - i for i in (2, 1)]
+        for i, (_, attitude) in zip((2, 1), frame.attitudes, strict=True):
+            error = attitude * rotation(2 * number - i).inv()
+            assert error.magnitude() < 1e-12
+    assert [stamp for stamp, _ in last] == [stamp_of(3)]
+
+
+def test_a_bag_without_calibration_says_nothing_of_it(tmp_path):
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.write_image(TOPIC, scene(0), FIRST_NS, FRAME_ID)
+    with open_recording(tmp_path / "bag") as recording:
+        (frame,) = recording
+        assert recording.problems == []
+    assert frame.camera is None
+    assert frame.attitudes == ()
+
+
+@pytest.mark.parametrize(
+    ("topics", "options", "used"),
+    [
+        (("/elsewhere/info", "/mount/attitude"), {}, ("/elsewhere/info", "/mount/attitude")),
+        (("/other/camera_info", "/other/attitude", "/camera/camera_info"), {}, None),
+        (
+            ("/camera/camera_info", "/b", "/b/camera_info"),
+            {"camera_info_topic": "b/camera_info"},
+            ("/b/camera_info", "/b"),
+        ),
+    ],
+    ids=["the only ones", "the one beside", "the one asked for"],
+)
+def test_which_calibration_and_attitude_are_read(tmp_path, topics, options, used):
+    with BagWriter(tmp_path / "bag") as bag:
+        for topic in (topics[0], *topics[2:]):
+            bag.write_camera_info(topic, camera_of(), FIRST_NS, FRAME_ID)
+        bag.write_attitude(topics[1], rotation(0), FIRST_NS, FRAME_ID)
+        bag.write_image(TOPIC, scene(0), FIRST_NS, FRAME_ID)
+    with open_recording(tmp_path / "bag", **options) as recording:
+        found = (recording.camera_info_topic, recording.attitude_topic)
+        (frame,) = recording
+        assert recording.problems == []
+    assert found == (used or ("/camera/camera_info", "/other/attitude"))
+    assert frame.camera is not None
+    assert len(frame.attitudes) == 1
+
+
+def test_among_several_calibrations_none_is_guessed(tmp_path):
+    with BagWriter(tmp_path / "bag") as bag:
+        for topic in ("/left/camera_info", "/right/camera_info"):
+            bag.write_camera_info(topic, camera_of(), FIRST_NS, FRAME_ID)
+        bag.write_image(TOPIC, scene(0), FIRST_NS, FRAME_ID)
+    with open_recording(tmp_path / "bag") as recording:
+        (frame,) = recording
+        (problem,) = recording.problems
+    assert frame.camera is None
+    assert "/left/camera_info, /right/camera_info" in problem
+    assert "/camera/camera_info" in problem
+    with pytest.raises(RecordingError, match=r"/camera/image_raw is no .*CameraInfo topic; there"):
+        open_recording(tmp_path / "bag", camera_info_topic=TOPIC)
+
+
+def test_useless_calibration_and_attitude_are_told_once_and_cost_no_frame(tmp_path):
+    """Of messages from another writer; the calibration's K[0] of 0 says: not calibrated."""
+    types = JAZZY.types
+    region = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, do_rectify=False)
+    nine = np.zeros(9)
+    with Writer(tmp_path / "bag", version=9) as writer:
+        topics = {
+            "/camera/camera_info": "sensor_msgs/msg/CameraInfo",
+            "/camera/attitude": "geometry_msgs/msg/QuaternionStamped",
+            TOPIC: IMAGE,
+        }
+        at = {
+            name: writer.add_connection(name, kind, typestore=JAZZY)
+            for name, kind in topics.items()
+        }
+        for number in range(3):
+            header = header_of(stamp_of(number))
+            info = types[topics["/camera/camera_info"]](
+                header, 20, 30, "plumb_bob", np.zeros(5), nine, nine, np.zeros(12), 0, 0, region
+            )
+            quaternion = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=2.0)
+            attitude = types[topics["/camera/attitude"]](header, quaternion)
+            image = image_message(scene(number), stamp_of(number))
+            for message, name in zip((info, attitude, image), topics, strict=True):
+                data = JAZZY.serialize_cdr(message, topics[name])
+                writer.write(at[name], stamp_of(number), data)
+    with open_recording(tmp_path / "bag") as recording:
+        frames = list(recording)
+        uncalibrated, length = recording.problems
+    assert len(frames) == 3
+    assert all(frame.camera is None and frame.attitudes == () for frame in frames)
+    assert uncalibrated.startswith("/camera/camera_info: ")
+    assert "not calibrated" in uncalibrated
+    assert "a quaternion of length 2 is no rotation" in length

@@ -40,7 +40,14 @@ from ofsat_ros.nodes.runtime import (
     reliable,
     run,
 )
-from ofsat_ros.parameters import DEFAULT_PRESET, DetectorParameters, Parameters, Table
+from ofsat_ros.nodes.sky import Sky
+from ofsat_ros.parameters import (
+    DEFAULT_PRESET,
+    CameraParameters,
+    DetectorParameters,
+    Parameters,
+    Table,
+)
 from ofsat_ros.pipeline import ImageError, Pipeline
 from ofsat_ros.tracking import TRACK_DTYPE
 
@@ -68,10 +75,15 @@ class Detector(Node):
         super().__init__("detector", context=context)
         preset = start_value(self, "preset", DEFAULT_PRESET)
         self._settings = NodeParameters(
-            self, Parameters.preset(preset), DetectorParameters(), changed=self._on_change
+            self,
+            Parameters.preset(preset),
+            CameraParameters(),
+            DetectorParameters(),
+            changed=self._on_change,
         )
         own = self._settings[DetectorParameters]
         self._pipeline = Pipeline(self._settings[Parameters])
+        self._sky = Sky(self, self._settings[CameraParameters])
         self._reset_wanted = ""
         backlog_s = None if own.reliable_input else own.backlog_s
         self._inbox = Inbox(own.queue_depth, backlog_s)
@@ -130,6 +142,8 @@ class Detector(Node):
     def _on_change(self, table: Table) -> None:
         if isinstance(table, Parameters):
             self._pipeline.parameters = table
+        elif isinstance(table, CameraParameters):
+            self._sky.set_parameters(table)
 
     def _on_image(self, message: Image | CompressedImage, info: dict) -> None:
         received_s = time.monotonic()
@@ -194,7 +208,12 @@ class Detector(Node):
             with timed(seconds, "convert"):
                 image = decode_message(message)
             with timed(seconds, "process"):
-                result = self._pipeline.process(image, messages.stamp_ns(header.stamp))
+                middle_ns = self._sky.middle_ns(messages.stamp_ns(header.stamp))
+                result = self._pipeline.process(image, middle_ns)
+            with timed(seconds, "locate"):
+                self._health.directions = self._sky.locate(
+                    middle_ns, result.shape, result.detections, result.tracks
+                )
         except (EncodingError, ImageError) as error:
             self._fail(header, str(error))
         # Whatever an image does to the stages, it must not take the node down.

@@ -69,6 +69,8 @@ class Health:
         self._zero_stamp = False
         self._result: FrameResult | None = None
         self.enabled = True
+        # Why directions are unknown, empty if they are known; and whether that is a fault.
+        self.directions: tuple[str, bool] = ("no image has come", False)
 
     def image_received(self, sequence: int | None, has_stamp: bool) -> None:
         """Count an image; `sequence` is its sender's number of it, None if that means nothing."""
@@ -178,6 +180,7 @@ class Health:
         silent = self.enabled and self.silence_s() > timeout_s
         with self._lock:
             failure = self._failure
+        unknown, faulty = self.directions
         found = [
             "" if self.enabled else "disabled by ~/enable: images are ignored",
             self.silence(publishers, elsewhere) if silent else "",
@@ -189,6 +192,7 @@ class Health:
             " header.stamp"
             if self._zero_stamp
             else "",
+            f"directions are unknown: {unknown}" if faulty else "",
         ]
         return [problem for problem in found if problem]
 
@@ -212,7 +216,9 @@ class Health:
             return values
         profile = _means(recent) | {"draw": self._drawing_s}
         steps = {f"profile_{step}_ms": 1e3 * seconds for step, seconds in profile.items()}
-        return values | _frame_values(result) | steps
+        return (
+            values | _frame_values(result) | {"directions": self.directions[0] or "known"} | steps
+        )
 
     def _rate_hz(self) -> float:
         now = time.monotonic()

@@ -38,7 +38,8 @@ CLOUD_DTYPE = np.dtype(
     [(name, "f4") for name in ("x", "y", "z")]
     + [(name, "f8") for name in ("u", "v", "u_rate", "v_rate", "rel_u_rate", "rel_v_rate")]
     + [(name, "f8") for name in ("sigma_u", "sigma_v", "snr", "flux", "length", "angle")]
-    + [("id", "u4"), ("ra", "f8"), ("dec", "f8"), ("status", "u1")],
+    + [("id", "u4"), ("ra", "f8"), ("dec", "f8"), ("status", "u1")]
+    + [("sigma_ra", "f8"), ("sigma_dec", "f8")],
     align=True,
 )
 # One row of rso_tracks: the same, and what only a track has.
@@ -75,6 +76,8 @@ _DETECTION_FIELDS = {
     "id": "track_id",
     "ra": "ra",
     "dec": "dec",
+    "sigma_ra": "sigma_ra",
+    "sigma_dec": "sigma_dec",
     "status": "status",
 }
 _TRACK_FIELDS = _DETECTION_FIELDS | {
@@ -177,17 +180,13 @@ def cloud_message(header: Header, rows: np.ndarray) -> PointCloud2:
 def detections_cloud(header: Header, detections: np.ndarray) -> PointCloud2:
     """Return the RSO detections of a frame (DETECTION_DTYPE) as ``rso_detections``.
 
-    Confirmed ones bear their track's id, candidates 0.  Lines of sight are NaN: there is no
-    calibration.
+    Confirmed ones bear their track's id, candidates 0.
     """
     return _cloud(header, detections, CLOUD_DTYPE, _DETECTION_FIELDS)
 
 
 def tracks_cloud(header: Header, tracks: np.ndarray) -> PointCloud2:
-    """Return the tracks of a frame (TRACK_DTYPE) as ``rso_tracks``, coasting ones included.
-
-    Lines of sight are NaN: there is no calibration.
-    """
+    """Return the tracks of a frame (TRACK_DTYPE) as ``rso_tracks``, coasting ones included."""
     return _cloud(header, tracks, TRACK_CLOUD_DTYPE, _TRACK_FIELDS)
 
 
@@ -335,17 +334,20 @@ def _cloud(
     rows = cloud_rows(len(array_), dtype)
     for field, column in columns.items():
         rows[field] = array_[column]
+    for field, column in zip("xyz", array_["sight"].T, strict=True):
+        rows[field] = column
     return cloud_message(header, rows)
 
 
 def _rows(cloud: PointCloud2, dtype: np.dtype, columns: Mapping[str, str]) -> np.ndarray:
     """The array whose columns are a cloud's fields; MessageError if one is missing."""
     points = cloud_array(cloud)
-    if missing := columns.keys() - set(points.dtype.names or ()):
+    if missing := {*columns, *"xyz"} - set(points.dtype.names or ()):
         raise MessageError(f"the cloud has no field {', '.join(sorted(missing))}")
     rows = np.zeros(len(points), dtype)
     for field, column in columns.items():
         rows[column] = points[field]
+    rows["sight"] = np.column_stack([points[axis] for axis in "xyz"])
     return rows
 
 

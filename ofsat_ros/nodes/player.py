@@ -2,7 +2,8 @@
 
 The recorded bytes go out as they are, on the recorded topics, with the recording's time on
 ``/clock``.  It waits for a subscriber before the first frame and for every reliable subscriber to
-have received the last.  While a detector answers and asks for every frame, at most a few frames
+have received the last.  Calibrations and attitudes go out with them, in the recorded order.
+While a detector answers and asks for every frame, at most a few frames
 are on their way to it: replay then slows down instead of losing frames.
 """
 
@@ -14,13 +15,14 @@ import threading
 import time
 from collections import deque
 
+from geometry_msgs.msg import QuaternionStamped
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import CompressedImage, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.ros_parameters import NodeParameters
@@ -33,9 +35,18 @@ from ofsat_ros.nodes.runtime import (
     run,
 )
 from ofsat_ros.parameters import PlayerParameters
-from ofsat_ros.recordings import Bag, RecordingError
+from ofsat_ros.recordings import (
+    ATTITUDE,
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    Bag,
+    RecordingError,
+)
 
-_TYPES = {"sensor_msgs/msg/Image": Image, "sensor_msgs/msg/CompressedImage": CompressedImage}
+_TYPES = {IMAGE: Image, COMPRESSED_IMAGE: CompressedImage}
+# What gives images directions; small, and of all cameras and mounts in the bag.
+_TYPES_BESIDE = {CAMERA_INFO: CameraInfo, ATTITUDE: QuaternionStamped}
 # Frames that may be on their way: kept by the middleware until received, or not yet answered.
 _DEPTH = 10
 _UNANSWERED = 4
@@ -86,6 +97,11 @@ class Player(Node):
         self._bag = _open(bag or own.bag)
         topics = _image_topics(self._bag, own.topic)
         self._publishers_of = {name: self._publisher(name) for name in topics}
+        self._beside = {
+            name: self._publisher(name)
+            for name, about in self._bag.topics.items()
+            if about.msgtype in _TYPES_BESIDE
+        }
         self._clock_publisher = (
             self.create_publisher(Clock, "/clock", reliable(_DEPTH)) if own.clock else None
         )
@@ -109,7 +125,7 @@ class Player(Node):
             self._bag.close()
 
     def _publisher(self, name: str) -> Publisher:
-        kind = _TYPES[self._bag.topics[name].msgtype]
+        kind = (_TYPES | _TYPES_BESIDE)[self._bag.topics[name].msgtype]
         return self.create_publisher(
             kind, name, reliable(_DEPTH), qos_overriding_options=overridable_qos()
         )
@@ -162,10 +178,16 @@ class Player(Node):
         own = self._settings[PlayerParameters]
         start_ns = self._bag.start_ns + round(own.start_s * _NS)
         count, last_ns, due_s = 0, None, time.monotonic()
-        for topic, _, time_ns, data in self._bag.messages(self._publishers_of, start_ns):
+        topics = [*self._publishers_of, *self._beside]
+        for topic, _, time_ns, data in self._bag.messages(topics, start_ns):
             last_ns = time_ns if last_ns is None else last_ns
             due_s = self._wait_until_due(last_ns, time_ns, due_s)
             last_ns = time_ns
+            if self._stop.is_set():
+                break
+            if topic in self._beside:
+                self._beside[topic].publish(bytes(data))
+                continue
             self._wait_for_answers(_UNANSWERED - 1)
             if self._stop.is_set():
                 break

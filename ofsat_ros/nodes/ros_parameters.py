@@ -68,7 +68,11 @@ class NodeParameters:
 
     def _declare(self, node: Node, table: Table) -> None:
         abouts = {about.name: about for about in table.describe()}
-        given = {n: p.value for n, p in _overrides(node).items() if n in abouts}
+        given = {
+            name: _as_text(given, abouts[name]).value
+            for name, given in _overrides(node).items()
+            if name in abouts
+        }
         table = table.replace(**given)
         self._tables[type(table)] = table
         for name, value in table.as_dict().items():
@@ -77,7 +81,7 @@ class NodeParameters:
             node.declare_parameter(name, value, _descriptor(abouts[name]), ignore_override=True)
 
     def _convert(self, parameters: list[Parameter]) -> list[Parameter]:
-        """Turn 2 into 2.0 where a number is asked for; refuse unknown names."""
+        """Turn 2 into 2.0 or "2" where a number or a text is asked for; refuse unknown names."""
         converted = []
         for parameter in parameters:
             about = self._descriptions.get(parameter.name)
@@ -87,6 +91,8 @@ class NodeParameters:
             if about is not None and isinstance(about.default, float):
                 if parameter.type_ is Parameter.Type.INTEGER:
                     parameter = Parameter(parameter.name, value=float(parameter.value))
+            if about is not None:
+                parameter = _as_text(parameter, about)
             converted.append(parameter)
         return converted
 
@@ -110,6 +116,14 @@ class NodeParameters:
                 own = changes.setdefault(self._owner[parameter.name], {})
                 own[parameter.name] = parameter.value
         return {kind: self._tables[kind].replace(**values) for kind, values in changes.items()}
+
+
+def _as_text(parameter: Parameter, about: Description) -> Parameter:
+    """Turn 4171 into "4171" where a text is asked for: ROS reads numbers as such."""
+    free = isinstance(about.default, str) and not about.choices
+    if free and parameter.type_ is Parameter.Type.INTEGER:
+        return Parameter(parameter.name, value=str(parameter.value))
+    return parameter
 
 
 def refuse_unknown(node: Node) -> None:

@@ -18,14 +18,27 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from ofsat_ros.camera import Camera, CameraError, rotation_of
 from ofsat_ros.images import EncodingError, decode_message
-from ofsat_ros.recordings.bag import COMPRESSED_IMAGE, IMAGE, Bag, RecordingError, Topic
+from ofsat_ros.recordings.bag import (
+    ATTITUDE,
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    Bag,
+    RecordingError,
+    Topic,
+)
 from ofsat_ros.recordings.bag_writer import BagWriter
 
 __all__ = [
+    "ATTITUDE",
+    "CAMERA_INFO",
     "COMPRESSED_IMAGE",
     "IMAGE",
+    "Attitude",
     "Bag",
     "BagWriter",
     "Frame",
@@ -39,6 +52,10 @@ _PROBLEMS_KEPT = 10
 # Frames that are read while one is in work; more would only take memory.
 _AHEAD = 2
 _NS = 1_000_000_000
+
+
+# A stamp, ns UTC, and the rotation from ICRS to the optical frame then.
+Attitude = tuple[int, Rotation]
 
 
 @dataclass(frozen=True)
@@ -55,15 +72,26 @@ class Frame:
         Coordinate frame of the header.
     number : int
         Its place among the images of the recording, those that could not be decoded included.
+    camera : Camera or None
+        The calibration recorded before it; None if there is none.
+    attitudes : tuple of Attitude
+        Those recorded since the frame before.
     """
 
     image: np.ndarray
     stamp_ns: int
     frame_id: str
     number: int = 0
+    camera: Camera | None = None
+    attitudes: tuple[Attitude, ...] = ()
 
 
-def open_recording(path: str | Path, topic: str | None = None) -> Recording:
+def open_recording(
+    path: str | Path,
+    topic: str | None = None,
+    camera_info_topic: str | None = None,
+    attitude_topic: str | None = None,
+) -> Recording:
     """Open a recording to read its frames.
 
     Parameters
@@ -72,6 +100,9 @@ def open_recording(path: str | Path, topic: str | None = None) -> Recording:
         A rosbag2 folder, a bare ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``.
     topic : str, optional
         Image topic to read; not needed if there is only one.
+    camera_info_topic, attitude_topic : str, optional
+        Topics of the calibration and of the attitude; not needed if they are ``camera_info`` and
+        ``attitude`` beside the image topic, or the only ones of their types.
 
     Returns
     -------
@@ -82,20 +113,26 @@ def open_recording(path: str | Path, topic: str | None = None) -> Recording:
     ------
     RecordingError
         If there is nothing at `path`, or nothing readable, or no image topic, or several and none
-        is chosen.
+        is chosen, or a chosen topic is not there.
     """
     thread = ThreadPoolExecutor(1, "recording")
     try:
-        return thread.submit(_open, path, topic, thread).result()
+        chosen = (topic, camera_info_topic, attitude_topic)
+        return thread.submit(_open, path, chosen, thread).result()
     except RecordingError:
         thread.shutdown()
         raise
 
 
-def _open(path: str | Path, topic: str | None, thread: ThreadPoolExecutor) -> Recording:
+def _open(
+    path: str | Path, chosen: tuple[str | None, str | None, str | None], thread: ThreadPoolExecutor
+) -> Recording:
     bag = Bag(path)
     try:
-        return Recording(bag, _choose(bag, topic), thread)
+        image = _choose(bag, chosen[0])
+        info = _choose_beside(bag, image, CAMERA_INFO, "camera_info", chosen[1])
+        attitude = _choose_beside(bag, image, ATTITUDE, "attitude", chosen[2])
+        return Recording(bag, image, info, attitude, thread)
     except RecordingError:
         bag.close()
         raise
@@ -113,6 +150,8 @@ class Recording:
     path : Path
     topic : str
         The topic read.
+    camera_info_topic, attitude_topic : str
+        Those read with it; empty if there is none.
     topics : dict of str to int
         Image topics of the recording and their counts of frames.
     skipped : int
@@ -126,13 +165,21 @@ class Recording:
         Time that the last iteration's reading and decoding took, in its own thread, s.
     """
 
-    def __init__(self, bag: Bag, topic: str, thread: ThreadPoolExecutor) -> None:
+    def __init__(
+        self,
+        bag: Bag,
+        topic: str,
+        camera_info_topic: str,
+        attitude_topic: str,
+        thread: ThreadPoolExecutor,
+    ) -> None:
         self._bag = bag
         # All that the bag does is done in this one thread, which SQLite may ask for.
         self._thread: ThreadPoolExecutor | None = thread
         self._coming: deque[Future[Frame | None]] = deque()
         self.path = bag.path
         self.topic = topic
+        self.camera_info_topic, self.attitude_topic = camera_info_topic, attitude_topic
         self.topics = {name: about.count for name, about in bag.topics.items() if about.is_image}
         self._start_over()
 
@@ -181,7 +228,11 @@ class Recording:
         self._start_over()
         count = 0
         try:
-            for _, msgtype, received_ns, data in self._bag.messages([self.topic]):
+            wanted = {self.topic, self.camera_info_topic, self.attitude_topic} - {""}
+            for topic, msgtype, received_ns, data in self._bag.messages(wanted):
+                if topic != self.topic:
+                    self._take_beside(topic, msgtype, data)
+                    continue
                 frame = self._decode(count, msgtype, received_ns, data)
                 count += 1
                 if frame is not None:
@@ -204,6 +255,29 @@ class Recording:
         self.seconds = 0.0
         self.problems = list(self._bag.problems)
         self._said_no_stamp = False
+        self._camera: Camera | None = None
+        self._attitudes: list[Attitude] = []
+        self._said_beside: set[str] = set()
+
+    @property
+    def last_attitudes(self) -> tuple[Attitude, ...]:
+        """Attitudes recorded after the last frame; complete when the iteration has ended."""
+        return tuple(self._attitudes)
+
+    def _take_beside(self, topic: str, msgtype: str, data: bytes) -> None:
+        """Take note of a calibration or an attitude; say the first reason why one is useless."""
+        try:
+            message = self._bag.deserialize(data, msgtype)
+            if msgtype == CAMERA_INFO:
+                self._camera = Camera.from_message(message)
+            else:
+                q, stamp = message.quaternion, message.header.stamp
+                stamp_ns = stamp.sec * _NS + stamp.nanosec
+                self._attitudes.append((stamp_ns, rotation_of(q.x, q.y, q.z, q.w)))
+        except (RecordingError, CameraError) as error:
+            if topic not in self._said_beside:
+                self._said_beside.add(topic)
+                self.problems.append(f"{topic}: {error}")
 
     def _decode(self, number: int, msgtype: str, received_ns: int, data: bytes) -> Frame | None:
         """Return a frame, or None and say why."""
@@ -218,7 +292,8 @@ class Recording:
         if stamp_ns == 0:
             stamp_ns = received_ns
             self._say_no_stamp(number)
-        return Frame(image, stamp_ns, message.header.frame_id, number)
+        attitudes, self._attitudes = tuple(self._attitudes), []
+        return Frame(image, stamp_ns, message.header.frame_id, number, self._camera, attitudes)
 
     def _skip(self, number: int, reason: str) -> None:
         self.skipped += 1
@@ -254,3 +329,22 @@ def _choose(bag: Bag, topic: str | None) -> str:
     if not images[name]:
         raise RecordingError(f"{bag.path}: topic {name} is empty; image topics are {listing}")
     return name
+
+
+def _choose_beside(bag: Bag, image: str, msgtype: str, name: str, wanted: str | None) -> str:
+    """Return the topic of a type that belongs to an image topic; empty if there is none."""
+    found = [topic for topic, about in bag.topics.items() if about.msgtype == msgtype]
+    if wanted is not None:
+        wanted = wanted if wanted in bag.topics else f"/{wanted}"
+        if wanted not in found:
+            listing = ", ".join(found) or "none"
+            raise RecordingError(f"{bag.path}: {wanted} is no {msgtype} topic; there is {listing}")
+        return wanted
+    beside = f"{image.removesuffix('/compressed').rpartition('/')[0]}/{name}"
+    if beside in found:
+        return beside
+    if len(found) > 1:
+        bag.problems.append(
+            f"several topics are {msgtype}, and none is {beside}; none is used: {', '.join(found)}"
+        )
+    return found[0] if len(found) == 1 else ""

@@ -17,6 +17,8 @@ from rosbags.typesys import Stores, get_typestore
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+ATTITUDE = "geometry_msgs/msg/QuaternionStamped"
 SUFFIXES = (".mcap", ".db3", ".bag")
 
 _ZSTD = b"\x28\xb5\x2f\xfd"  # never the first bytes of CDR

@@ -18,9 +18,18 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer, WriterError
 from rosbags.typesys import Stores, TypesysError, get_typestore
+from scipy.spatial.transform import Rotation
 
+from ofsat_ros.camera import Camera
 from ofsat_ros.images import EncodingError, decode_image, encode_png
-from ofsat_ros.recordings.bag import COMPRESSED_IMAGE, IMAGE, SUFFIXES, RecordingError
+from ofsat_ros.recordings.bag import (
+    ATTITUDE,
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    SUFFIXES,
+    RecordingError,
+)
 
 _NS = 1_000_000_000
 _STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
@@ -174,15 +183,46 @@ class BagWriter:
         RecordingError
             As `write`, or if no encoding fits the array.
         """
+        name = encoding or _encoding_of(image)
+        fields = _png_fields(image, name) if compressed else _raw_fields(image, name)
+        msgtype = COMPRESSED_IMAGE if compressed else IMAGE
+        self._write_stamped(topic, msgtype, stamp_ns, frame_id, fields)
+
+    def write_camera_info(self, topic: str, camera: Camera, stamp_ns: int, frame_id: str) -> None:
+        """Write a camera's calibration as sensor_msgs/CameraInfo; raises as `write_image`."""
+        types = self._typestore.types
+        k = camera.matrix
+        fields = {
+            "width": camera.width,
+            "height": camera.height,
+            "distortion_model": camera.model,
+            "d": np.array(camera.distortion, float),
+            "k": k.ravel(),
+            "r": np.eye(3).ravel(),
+            "p": np.column_stack([k, np.zeros(3)]).ravel(),
+            "binning_x": 0,
+            "binning_y": 0,
+            "roi": types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, do_rectify=False),
+        }
+        self._write_stamped(topic, CAMERA_INFO, stamp_ns, frame_id, fields)
+
+    def write_attitude(self, topic: str, attitude: Rotation, stamp_ns: int, frame_id: str) -> None:
+        """Write the rotation ICRS -> optical frame; raises as `write_image`."""
+        types = self._typestore.types
+        x, y, z, w = attitude.as_quat().tolist()
+        fields = {"quaternion": types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)}
+        self._write_stamped(topic, ATTITUDE, stamp_ns, frame_id, fields)
+
+    def _write_stamped(
+        self, topic: str, msgtype: str, stamp_ns: int, frame_id: str, fields: dict[str, Any]
+    ) -> None:
+        """Write a message with a header, at the time of its stamp."""
         types = self._typestore.types
         sec, nanosec = divmod(int(stamp_ns), _NS)
         if not 0 <= sec < 2**31:
             raise RecordingError(f"{topic}: a header cannot hold the stamp {stamp_ns} ns")
         stamp = types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
         header = types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame_id)
-        name = encoding or _encoding_of(image)
-        fields = _png_fields(image, name) if compressed else _raw_fields(image, name)
-        msgtype = COMPRESSED_IMAGE if compressed else IMAGE
         message = types[msgtype](header=header, **fields)
         self.write(topic, msgtype, self._typestore.serialize_cdr(message, msgtype), stamp_ns)
 

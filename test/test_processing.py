@@ -1,0 +1,167 @@
+"""Directions and times of ``ofsat process``: calibration and attitude from the recording."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from scipy.spatial.transform import Rotation
+
+from ofsat_ros.camera import Camera
+from ofsat_ros.cli import main
+from ofsat_ros.recordings import BagWriter
+from ofsat_ros.simulation import scenario, write_truth
+
+SIZE = {"width": 200, "height": 160}
+FRAMES = 12
+# 5 arcsec/px, as the scenario has them.
+SCALE_RAD = np.radians(5 / 3600)
+FRAME_ID = "camera_optical_frame"
+IMAGE, INFO, ATTITUDE = "/camera/image_raw", "/camera/camera_info", "/camera/attitude"
+
+
+def attitude_at(stamp_ns: int, start_ns: int) -> Rotation:
+    """A camera that turns about its boresight, near declination 60 deg."""
+    seconds = (stamp_ns - start_ns) / 1e9
+    return Rotation.from_euler("zxz", [2e-3 * seconds, np.radians(30), 1.0])
+
+
+def write_bag(
+    path: Path,
+    calibrated: bool = True,
+    attitudes: bool = True,
+    shift_ns: int = 0,
+    size: tuple[int, int] = (SIZE["width"], SIZE["height"]),
+) -> list:
+    """A recording whose attitudes lie between its frames; its image stamps may be shifted."""
+    frames = list(scenario("survey", 1, frames=FRAMES, **SIZE))
+    start_ns = frames[0].stamp_ns
+    with BagWriter(path) as bag:
+        for frame in frames:
+            stamp_ns = frame.stamp_ns
+            if calibrated:
+                bag.write_camera_info(INFO, Camera.ideal(*size, SCALE_RAD), stamp_ns, FRAME_ID)
+            if attitudes:
+                for at_ns in (stamp_ns - 600_000_000, stamp_ns - 200_000_000):
+                    bag.write_attitude(ATTITUDE, attitude_at(at_ns, start_ns), at_ns, FRAME_ID)
+            bag.write_image(IMAGE, frame.image, stamp_ns + shift_ns, FRAME_ID)
+    write_truth(f"{path}.truth.csv", [frame.truth for frame in frames])
+    return frames
+
+
+def process(bag: Path, output: Path, *options: object) -> tuple[Result, list[dict]]:
+    command = ["process", str(bag), "-o", str(output), *map(str, options)]
+    done = CliRunner().invoke(main, command)
+    assert done.exit_code == 0, done.output
+    with (output / "detections.csv").open(encoding="utf-8") as file:
+        return done, list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("bags") / "bag"
+    write_bag(path)
+    return path
+
+
+def gnomonic(x: float, y: float) -> np.ndarray:
+    """Line of sight of a pixel of an ideal camera, by hand."""
+    offset = np.array([x - (SIZE["width"] - 1) / 2, y - (SIZE["height"] - 1) / 2]) * SCALE_RAD
+    vector = np.array([*offset, 1.0])
+    return vector / np.linalg.norm(vector)
+
+
+def test_each_detection_has_the_direction_of_its_pixel_at_mid_exposure(bag, tmp_path):
+    done, rows = process(bag, tmp_path)
+    assert done.stderr == ""
+    assert len(rows) > 3 * FRAMES
+    start_ns = min(int(row["stamp_ns"]) for row in rows)
+    for row in rows:
+        ra, dec = np.radians([float(row["ra_deg"]), float(row["dec_deg"])])
+        icrs = [np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]
+        sight = attitude_at(int(row["stamp_ns"]), start_ns).apply(icrs)
+        expected = gnomonic(float(row["x_px"]), float(row["y_px"]))
+        # Nine digits in the file are 2e-8 rad of the angles, and 1e-7 px.
+        assert np.linalg.norm(sight - expected) < 5e-8
+
+
+def test_the_last_word_and_the_live_one_have_the_same_directions(bag, tmp_path):
+    """Confirmed rows of both: the attitude is carried on live, and the camera turns evenly."""
+    _, late = process(bag, tmp_path / "late")
+    _, live = process(bag, tmp_path / "live", "--live")
+    known = {(row["frame"], row["track_id"]): row for row in late}
+    shared = [row for row in live if row["confirmed"] == "1"]
+    assert len(shared) > FRAMES
+    for row in shared:
+        for name in ("ra_deg", "dec_deg"):
+            other = known[row["frame"], row["track_id"]]
+            assert float(row[name]) == pytest.approx(float(other[name]), abs=2e-6)
+
+
+@pytest.mark.parametrize(("reference", "shift"), [("start", -0.5), ("end", 0.5), ("middle", 0.0)])
+def test_stamps_are_turned_into_the_middle_of_the_exposure(bag, reference, shift, tmp_path):
+    """A driver that stamps start or end of 1 s, whose clock is 0.25 s behind."""
+    shifted = tmp_path / "bag"
+    write_bag(shifted, shift_ns=round((shift - 0.25) * 1e9))
+    options = ("--stamp-reference", reference, "--exposure-time-s", 1, "--stamp-offset-s", 0.25)
+    _, rows = process(shifted, tmp_path / "shifted", *options)
+    _, plain = process(bag, tmp_path / "plain")
+    assert rows == plain
+
+
+@pytest.mark.parametrize(
+    ("kinds", "note"),
+    [
+        ({"calibrated": False, "attitudes": False}, ""),
+        ({"calibrated": False}, ""),
+        ({"attitudes": False}, "detections have no ra and dec: no attitude has come"),
+        ({"size": (100, 80)}, "camera_info is for images of 100x80, not of 200x160"),
+    ],
+    ids=["nothing", "no calibration", "no attitude", "another size"],
+)
+def test_directions_that_are_unknown_are_nan_and_said(kinds, note, tmp_path):
+    write_bag(tmp_path / "bag", **kinds)
+    done, rows = process(tmp_path / "bag", tmp_path / "out")
+    assert len(rows) > 3 * FRAMES
+    assert {row["ra_deg"] for row in rows} == {row["dec_deg"] for row in rows} == {"nan"}
+    words = " ".join(done.stderr.split())
+    assert note in words if note else words == ""
+
+
+def test_an_old_attitude_does_not_count(bag, tmp_path):
+    """The nearest attitude is 0.2 s before each frame; two are 0.4 s apart."""
+    _, rows = process(bag, tmp_path / "out", "--attitude-max-age-s", 0.15, "--live")
+    assert {row["ra_deg"] for row in rows} == {"nan"}
+
+
+def test_tracking_data_hold_the_tracks_directions(bag, tmp_path):
+    formats = ("--tdm", "kvn", "--tdm", "xml", "--tdm", "iod", "--station", 4171)
+    done, rows = process(bag, tmp_path, *formats)
+    assert "tracks.tdm, tracks.xml and tracks.iod are in" in " ".join(done.stdout.split())
+    lines = (tmp_path / "tracks.tdm").read_text().splitlines()
+    angles = [float(line.split()[-1]) for line in lines if line.startswith("ANGLE_1 ")]
+    wanted = [float(row["ra_deg"]) for row in sorted(rows, key=lambda row: int(row["track_id"]))]
+    # By track, in the order of time; the CSV has nine digits.
+    assert sorted(angles) == pytest.approx(sorted(value % 360 for value in wanted), abs=1e-6)
+    assert len((tmp_path / "tracks.iod").read_text().splitlines()) == len(rows)
+    assert (tmp_path / "tracks.xml").read_text().count("<ANGLE_1>") == len(rows)
+
+
+def test_tracking_data_without_directions_are_not_written_and_said(tmp_path):
+    write_bag(tmp_path / "bag", attitudes=False)
+    done, _ = process(tmp_path / "bag", tmp_path / "out", "--tdm", "kvn")
+    assert not (tmp_path / "out" / "tracks.tdm").exists()
+    words = " ".join(done.stderr.split())
+    assert "no tracking data is written: no track has ra and dec in 3 frames" in words
+
+
+def test_tracking_data_are_not_overwritten_unless_told(bag, tmp_path):
+    (tmp_path / "tracks.tdm").write_text("precious")
+    command = ["process", str(bag), "-o", str(tmp_path), "--tdm", "kvn"]
+    done = CliRunner().invoke(main, command)
+    assert done.exit_code == 1
+    assert "already holds tracks.tdm" in " ".join(done.stderr.split())
+    assert (tmp_path / "tracks.tdm").read_text() == "precious"
+    assert CliRunner().invoke(main, [*command, "--force"]).exit_code == 0
+    assert (tmp_path / "tracks.tdm").read_text().startswith("CCSDS_TDM_VERS")
