@@ -32,6 +32,7 @@ TEST = [
     "hypothesis",
     "pytest>=9",
     "sep",
+    *SKY,
     *("ccsds-ndm", "lxml"),  # reads back what we write; GPL, so for tests only
     "setuptools>=70.1,<80",  # the range in which colcon and pip can both build with it
 ]

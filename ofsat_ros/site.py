@@ -8,9 +8,9 @@ in (IAU 2006/2000A, ERFA's atco13); refraction only if a pressure is given.  A d
 not come from a catalogue's stars has not lost the annual aberration, and would get it twice (20").
 
 Nothing is downloaded: the Earth's rotation is that of the tables that astropy brings along.
-Where they are measured, azimuth and elevation are right to 0.01"; in the year that they predict,
-to about 0.5" at its end.  Outside them the nearest known day's values are taken, which are wrong
-by up to 1.8 s in UT1-UTC (27" along the equator) and 1" in the place of the pole.
+Where they are measured, azimuth and elevation are right to 0.01"; where they predict, to about
+0.5" a year ahead.  Outside them the nearest known day's values are taken, which are wrong by up to
+1.8 s in UT1-UTC (27" along the equator) and 1" in the place of the pole.
 """
 
 from __future__ import annotations
@@ -133,6 +133,8 @@ def azimuth_elevation(
             f" python3-astropy ({error})",
             name=error.name,
         ) from error
+    if not ra.size:  # of which older astropy's tables cannot tell
+        return np.zeros(ra.shape), np.zeros(ra.shape)
     with (
         warnings.catch_warnings(),
         np.errstate(invalid="ignore"),  # NaN of unknown directions

@@ -179,8 +179,8 @@ class Astrometry:
             return why
         rows["ra"], rows["dec"] = to_radec(sight, attitude)
         spread = _along_sky(slopes, rows["ra"], rows["dec"], attitude)
-        sigmas = _columns(rows, "sigma_x", "sigma_y")[:, None, :]
-        rows["sigma_ra"], rows["sigma_dec"] = np.sqrt(np.square(spread * sigmas).sum(-1)).T
+        spread *= _columns(rows, "sigma_x", "sigma_y")[:, None, :]
+        rows["sigma_ra"], rows["sigma_dec"] = np.hypot(spread[:, :, 0], spread[:, :, 1]).T
         if np.isnan(sight[:, 0]).any():
             return "the calibration's distortion cannot be inverted at some of the pixels"
         return ""
@@ -209,7 +209,7 @@ class Astrometry:
 
 
 def _columns(rows: NDArray[np.void], *names: str) -> Array:
-    return np.stack([rows[name] for name in names], -1)
+    return np.array([rows[name] for name in names]).T
 
 
 def _along_sky(slopes: Array, ra: Array, dec: Array, attitude: Rotation) -> Array:
@@ -217,10 +217,9 @@ def _along_sky(slopes: Array, ra: Array, dec: Array, attitude: Rotation) -> Arra
 
     At a pole, east is that of the right ascension that is stated there.
     """
-    east_north = np.zeros((len(ra), 2, 3))
-    east_north[:, 0, 0], east_north[:, 0, 1] = -np.sin(ra), np.cos(ra)
-    east_north[:, 1, 0] = -np.sin(dec) * np.cos(ra)
-    east_north[:, 1, 1] = -np.sin(dec) * np.sin(ra)
-    east_north[:, 1, 2] = np.cos(dec)
+    sin_ra, cos_ra, sin_dec, cos_dec = np.sin(ra), np.cos(ra), np.sin(dec), np.cos(dec)
+    east = [-sin_ra, cos_ra, np.zeros(len(ra))]
+    north = [-sin_dec * cos_ra, -sin_dec * sin_ra, cos_dec]
+    east_north = np.array([east, north]).transpose(2, 0, 1)
     along: Array = east_north @ (attitude.as_matrix().T @ slopes)
     return along

@@ -30,6 +30,7 @@ _RADII, _DIRECTIONS = 512, 24
 _LEAST_SLOPE = 1e-6
 _TABLE = 4096
 _STEPS = 15
+_UNIT = np.eye(3)
 _TINY = np.finfo(float).tiny
 _PRECISION = 1e-12
 # Beside 1, of what is multiplied with powers of the field.
@@ -64,7 +65,7 @@ class Pinhole:
         sight = np.empty((len(points), 3))
         sight[:, :2], sight[:, 2:] = points / length, 1 / length
         # The part of a step on the plane that is across the direction, over the distance.
-        slopes = np.eye(3)[:, :2] - sight[:, :, None] * sight[:, None, :2]
+        slopes = _UNIT[:, :2] - sight[:, :, None] * sight[:, None, :2]
         return sight, slopes / length[:, :, None]
 
 
@@ -129,28 +130,27 @@ class Brown:
         slope = k1 + r2 * (2 * k2 + 3 * k3 * r2) - factor * (k4 + r2 * (2 * k5 + 3 * k6 * r2))
         return factor, slope / below
 
-    def _decentre(self, x: Array, y: Array, r2: Array) -> tuple[Array, Array]:
-        """Return what is added to the radial part."""
+    def _decentre(self, x: Array, y: Array, r2: Array) -> tuple[Array, Array, Array]:
+        """Return what is added: to the radial factor, and by the square of the radius."""
         (p1, p2), (s1, s2, s3, s4) = self._tangential, self._prism
-        both = 2 * (p1 * y + p2 * x)
-        return x * both + r2 * (p2 + s1 + s2 * r2), y * both + r2 * (p1 + s3 + s4 * r2)
+        return 2 * (p1 * y + p2 * x), p2 + s1 + s2 * r2, p1 + s3 + s4 * r2
 
     def _distort(self, x: Array, y: Array) -> tuple[tuple[Array, Array], Slopes]:
         """Return the image of points of the ideal plane, and the derivatives."""
-        (p1, p2), (s1, s2, s3, s4) = self._tangential, self._prism
+        (p1, p2), (_, s2, _, s4) = self._tangential, self._prism
         r2 = x * x + y * y
         factor, slope = self._radial(r2)
-        more_x, more_y = self._decentre(x, y, r2)
-        both = factor + 2 * (p1 * y + p2 * x)
-        both_x, both_y = 2 * (slope * x + p2), 2 * (slope * y + p1)
-        across_x, across_y = 2 * (p2 + s1 + 2 * s2 * r2), 2 * (p1 + s3 + 2 * s4 * r2)
+        more, square_x, square_y = self._decentre(x, y, r2)
+        factor = factor + more
+        factor_x, factor_y = 2 * (slope * x + p2), 2 * (slope * y + p1)
+        across_x, across_y = 2 * (square_x + s2 * r2), 2 * (square_y + s4 * r2)
         slopes = (
-            both + x * (both_x + across_x),
-            x * both_y + y * across_x,
-            y * both_x + x * across_y,
-            both + y * (both_y + across_y),
+            factor + x * (factor_x + across_x),
+            x * factor_y + y * across_x,
+            y * factor_x + x * across_y,
+            factor + y * (factor_y + across_y),
         )
-        return (x * factor + more_x, y * factor + more_y), slopes
+        return (x * factor + r2 * square_x, y * factor + r2 * square_y), slopes
 
     def _undistort(self, points: Array, tolerance: float) -> tuple[Array, Slopes]:
         """Return the ideal plane's points (N, 2), and the derivatives there, by Newton's method.
@@ -162,13 +162,14 @@ class Brown:
         allowed = np.maximum(tolerance, _PRECISION * distance)
         u, v = np.where(distance <= self._reach, points.T, np.nan)
         x, y = self._without_radial(u, v)
-        more_x, more_y = self._decentre(x, y, x * x + y * y)
-        x, y = self._without_radial(u - more_x, v - more_y)
+        r2 = x * x + y * y
+        more, square_x, square_y = self._decentre(x, y, r2)
+        x, y = self._without_radial(u - x * more - r2 * square_x, v - y * more - r2 * square_y)
         for step in range(_STEPS):
             image, slopes = self._distort(x, y)
             missed_x, missed_y = u - image[0], v - image[1]
             missed = np.hypot(missed_x, missed_y)
-            if step == _STEPS - 1 or not (missed > 0.1 * allowed).any():
+            if step == _STEPS - 1 or not (missed > allowed).any():
                 break
             (a, b, c, d), scale = slopes, _determinant(slopes)
             x = x + (d * missed_x - b * missed_y) / scale
@@ -251,7 +252,7 @@ class Fisheye:
         for _ in range(_STEPS):
             reached, slope = self._distort(angle)
             missed = distance - reached
-            if not (np.abs(missed) > 0.1 * allowed).any():
+            if not (np.abs(missed) > allowed).any():
                 break
             angle = np.clip(angle + missed / slope, 0.0, self._angles[-1])
         return np.where(np.abs(missed) <= allowed, angle, np.nan), slope

@@ -208,10 +208,11 @@ class Camera:
     def sights_with_jacobians(self, xy: ArrayLike) -> tuple[Array, Array]:
         """Return `lines_of_sight` and `jacobians`, for the price of one of them."""
         points = (_pairs(xy) - self.matrix[:2, 2]) @ self._inverse.T
-        tolerance = _TOLERANCE_PX / np.abs(self.matrix[[0, 1], [0, 1]]).max()
-        sight, slopes = self._lens.sights(points, float(tolerance))
+        tolerance = _TOLERANCE_PX / max(self.matrix[0, 0], self.matrix[1, 1])
+        sight, slopes = self._lens.sights(points, tolerance)
         unknown = np.isnan(sight).any(1)
-        sight[unknown] = slopes[unknown] = np.nan
+        if unknown.any():
+            sight[unknown] = slopes[unknown] = np.nan
         return sight, slopes @ self._inverse
 
     @np.errstate(all="ignore")
