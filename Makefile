@@ -23,6 +23,7 @@ endif
 .PHONY: help
 help:
 	$(say) 'make demo   replay a sample bag to the detector over DDS; results in demo_output/'
+	$(say) 'make demo-guide  a simulated mount follows a satellite; results in demo_guide_output/'
 	$(say) 'make test   run all tests'
 	$(say) 'make lint   check format, style and types'
 	$(say) "make bench  the paper's scenes, detection beside its peers, and speed, as tables"
@@ -32,6 +33,11 @@ help:
 demo: $(STAMP)
 	$(say) 'demo: player -> detector -> recorder; results go to demo_output/'
 	@$(BIN)/demo --output demo_output
+
+.PHONY: demo-guide
+demo-guide: $(STAMP)
+	$(say) 'demo-guide: simulator -> detector -> guide -> simulator; results go to demo_guide_output/'
+	@$(BIN)/demo_guide --output demo_guide_output
 
 .PHONY: test
 test: $(STAMP)
@@ -56,11 +62,13 @@ bench: $(STAMP)
 	$(say) 'bench: speed against SExtractor, and throughput over DDS'
 	@$(BIN)/python -m benchmarks.speed
 	@$(BIN)/python -m benchmarks.throughput
+	$(say) 'bench: an orbit out of the angles of a pass'
+	@$(BIN)/python -m benchmarks.orbit
 
 .PHONY: clean
 clean:
-	$(say) 'clean: .venv, demo_output, build, install, log and caches'
-	@rm -rf $(VENV) demo_output build install log .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	$(say) 'clean: .venv, demo outputs, build, install, log and caches'
+	@rm -rf $(VENV) demo_output demo_guide_output build install log .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	@rm -rf *.egg-info
 	@find . -name __pycache__ -prune -exec rm -rf {} +
 

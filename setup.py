@@ -25,20 +25,24 @@ ROS = [
 ]
 LINT = ["mypy>=2.4,<3", "ruff>=0.17,<0.18", "types-PyYAML", "types-tqdm"]
 SKY = ["astropy"]
-BENCH = ["matplotlib", "sgp4", *SKY]
+PLOT = ["matplotlib"]
+BENCH = ["sgp4", *PLOT, *SKY]
 TEST = [
     "colcon-core",
     "colcon-ros",
     "hypothesis",
     "pytest>=9",
     "sep",
-    *SKY,
+    *(*SKY, *PLOT, "sgp4"),
     *("ccsds-ndm", "lxml"),  # reads back what we write; GPL, so for tests only
     "setuptools>=70.1,<80",  # the range in which colcon and pip can both build with it
 ]
 
 SAMPLE_BAG = "bags/survey_png"  # the smallest
-NODES = ("detector", "player", "simulator", "recorder", "guide", "tdm_writer", "demo")
+NODES = (
+    *("detector", "player", "simulator", "recorder", "guide", "tdm_writer"),
+    *("demo", "demo_guide"),
+)
 
 setup(
     name=NAME,
@@ -65,10 +69,11 @@ setup(
         "ros": ROS,
         "opencv": OPENCV,
         "sky": SKY,
+        "plot": PLOT,
         "lint": LINT,
         "test": TEST,
         "bench": BENCH,
-        "all": [*ROS, *SKY, *LINT, *TEST, *BENCH],
+        "all": [*ROS, *SKY, *PLOT, *LINT, *TEST, *BENCH],
     },
     entry_points={
         "console_scripts": [

@@ -331,7 +331,7 @@ def test_ctrl_c_while_a_process_starts_leaves_none_behind(monkeypatch):
         return process
 
     monkeypatch.setattr(subprocess, "Popen", interrupted)
-    with pytest.raises(KeyboardInterrupt), demo._children() as start:
+    with pytest.raises(KeyboardInterrupt), demo.children() as start:
         start("player")
     (process,) = started
     assert process.returncode is not None

@@ -20,7 +20,10 @@ import ofsat_ros
 from ofsat_ros.parameters import Parameters
 
 ROOT = Path(__file__).parents[1]
-NODES = {"demo", "detector", "player", "recorder", "simulator"}
+NODES = {
+    *("demo", "demo_guide", "detector", "guide", "player", "recorder", "simulator"),
+    "tdm_writer",
+}
 # What Python imports under another name than rosdep or pip know it by.
 ROSDEP_KEYS = {
     "click": "python3-click",

@@ -29,6 +29,8 @@ READY = {
     "player": "waiting for 1 subscriber",
     "recorder": "recording into",
     "simulator": "px every",
+    "guide": "waiting for tracks on",
+    "tdm_writer": "writing the tracks of",
 }
 # What only a machine with ROS from apt can do, and what the tests of colcon and launch do.
 ELSEWHERE = ("rosdep install", "pip install", "colcon build", "source install", "ros2 launch")

@@ -15,19 +15,17 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import ofsat_ros
+from ofsat_ros.nodes.processes import children
 from ofsat_ros.nodes.recorder import BAG, HEARING
-from ofsat_ros.recordings import COMPRESSED_IMAGE, Bag, RecordingError
+from ofsat_ros.recordings import COMPRESSED_IMAGE, Bag, RecordingError, open_recording
 from ofsat_ros.results import DETECTIONS, in_words
 
 _START_S = 30.0
 # Without a new line from anybody for so long, a frame will not be answered any more.
 _SILENCE_S = 30.0
-_PATIENCE_S = {signal.SIGINT: 5.0, signal.SIGTERM: 2.0, signal.SIGKILL: 2.0}
 
 
 class DemoError(Exception):
@@ -66,12 +64,13 @@ def _run(options: argparse.Namespace) -> int:
     name = "image/compressed" if compressed else "image"
     transport = "compressed" if compressed else "raw"
     print(f"demo: {count} frames of {topic} in {bag}")
-    with _children() as start:
+    with children() as start:
         recorder = start(
             "recorder",
             *("-p", f"output:={options.output}"),
             *("-p", "overwrite:=true"),
             *("-p", f"frames:={count}"),
+            piped=True,
         )
         lines = _Echo(recorder)
         detector = start(
@@ -79,6 +78,7 @@ def _run(options: argparse.Namespace) -> int:
             *("-p", "reliable_input:=true"),
             *("-p", f"image_transport:={transport}"),
             *("-r", f"{name}:={topic}"),
+            *_remaps_beside(bag, topic),
         )
         lines.wait_for(HEARING, detector)
         player = start(
@@ -109,62 +109,14 @@ def _image_topic(path: Path) -> tuple[str, bool, int]:
     raise DemoError(f"{path} holds no images")
 
 
-@contextmanager
-def _children() -> Iterator:
-    """Give a function that starts a node; all that were started are ended in any case."""
-    running: list[subprocess.Popen] = []
-    environment = {
-        # Nobody else's graph: the demo neither hears nor disturbs one.
-        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        **os.environ,
-    }
-
-    def start(node: str, *ros_arguments: str) -> subprocess.Popen:
-        output = subprocess.PIPE if node == "recorder" else None
-        command = [sys.executable, "-m", f"ofsat_ros.nodes.{node}", "--ros-args", *ros_arguments]
-        with _signals_held_back():
-            # An own session: Ctrl-C reaches this process, which then ends them in order.
-            process = subprocess.Popen(
-                command, stdout=output, text=True, env=environment, start_new_session=True
-            )
-            running.append(process)
-        return process
-
-    try:
-        yield start
-    finally:
-        with _signals_held_back():
-            for process in reversed(running):
-                _end(process)
-
-
-@contextmanager
-def _signals_held_back() -> Iterator[None]:
-    """Let SIGINT and SIGTERM wait: a process that starts just now must be known, to be ended."""
-    came: list[int] = []
-    before = {
-        number: signal.signal(number, lambda *_: came.append(1))
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-    if came:
-        raise KeyboardInterrupt
-
-
-def _end(process: subprocess.Popen) -> None:
-    for number, patience_s in _PATIENCE_S.items():
-        if process.poll() is not None:
-            return
-        process.send_signal(number)
-        try:
-            process.wait(patience_s)
-        except subprocess.TimeoutExpired:
-            continue
+def _remaps_beside(bag: Path, topic: str) -> list[str]:
+    """Return the arguments that join the detector to calibration and attitude, if there are."""
+    with open_recording(bag, topic) as recording:
+        beside = {
+            "camera_info": recording.camera_info_topic,
+            "attitude": recording.attitude_topic,
+        }
+    return [word for name, it in beside.items() if it for word in ("-r", f"{name}:={it}")]
 
 
 class _Echo:
