@@ -185,8 +185,9 @@ class Processing:
 
     def _write_settled(self, settled: list[Settled]) -> None:
         for last in settled:
-            number = self._numbers.pop(last.frame)
-            if not self._live:
+            # A frame in which an error ended all is in the history, but was not answered.
+            number = self._numbers.pop(last.frame, None)
+            if number is not None and not self._live:
                 self._write_detections(last.stamp_ns, number, last.detections)
 
     def _write_detections(self, stamp_ns: int, frame: int, detections: Detections) -> None:

@@ -17,6 +17,8 @@ import numpy as np
 import pytest
 from ros_graph import Process
 
+from ofsat_ros.camera import to_radec
+from ofsat_ros.detection import DETECTION_DTYPE
 from ofsat_ros.parameters import Parameters
 from ofsat_ros.results import DETECTION_COLUMNS, STAR_FIELD_COLUMNS, TRACK_COLUMNS
 
@@ -42,10 +44,17 @@ def commands(text: str) -> list[str]:
     return [line for block in blocks for line in block.strip().splitlines()]
 
 
-def starting(prefix: str) -> list[str]:
-    found = [line for line in commands(README) if line.startswith(prefix)]
+def starting(prefix: str, text: str = README) -> list[str]:
+    found = [line for line in commands(text) if line.startswith(prefix)]
     assert found, prefix
     return found
+
+
+def example(with_words: str) -> str:
+    """The one block of Python in docs/integration.md that holds some words."""
+    blocks = re.findall(r"```python\n(.*?)```", INTEGRATION, re.S)
+    (code,) = [block for block in blocks if with_words in block]
+    return code
 
 
 def installed(text: str) -> str:
@@ -66,7 +75,7 @@ def test_make_targets_are_what_ci_runs() -> None:
 
 def test_ofsat_commands_run(tmp_path: Path) -> None:
     (tmp_path / "bags").symlink_to(ROOT / "bags")
-    for line in starting(".venv/bin/ofsat "):
+    for line in (*starting(".venv/bin/ofsat "), *starting("ofsat ", INTEGRATION)):
         arguments = shlex.split(line)[1:]
         done = subprocess.run(
             [sys.executable, "-m", "ofsat_ros.cli", *arguments],
@@ -79,9 +88,13 @@ def test_ofsat_commands_run(tmp_path: Path) -> None:
         assert done.returncode == 0, (line, done.stderr)
     assert (tmp_path / "night1" / "detections.csv").stat().st_size > 1000
     assert (tmp_path / "my_sky.truth.csv").exists()
+    for name in ("night1_angles/tracks.tdm", "night1_angles/tracks.iod", "out/tracks.tdm"):
+        assert (tmp_path / name).stat().st_size > 1000
 
 
-@pytest.mark.parametrize("line", starting("ros2 run ofsat_ros "))
+@pytest.mark.parametrize(
+    "line", [*starting("ros2 run ofsat_ros "), *starting("ros2 run ofsat_ros ", INTEGRATION)]
+)
 def test_ros2_run_commands_start_and_stop(line: str, tmp_path: Path) -> None:
     node, *arguments = shlex.split(installed(line))[3:]
     # What it writes shall not land in the tree.
@@ -113,9 +126,38 @@ def test_python_example_runs(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(ROOT)
-    (code,) = re.findall(r"```python\n(.*?)```", INTEGRATION, re.S)
-    exec(compile(code, "docs/integration.md", "exec"), {})
+    exec(compile(example("open_recording("), "docs/integration.md", "exec"), {})
     assert len(capsys.readouterr().out.splitlines()) > 20
+
+
+def test_the_attitude_of_a_plate_solution_is_as_the_docs_say() -> None:
+    names: dict = {}
+    exec(compile(example("def attitude_of("), "docs/integration.md", "exec"), names)
+    ra, dec, position_angle = 2.0, 1.1, 0.4
+    attitude = names["attitude_of"](ra, dec, position_angle)
+    # The centre, what is a little up in the image, and what is to its left: north through east.
+    step = 1e-4
+    up_left = np.array([[0, 0, 1], [0, -step, 1], [-step, 0, 1]])
+    ras, decs = to_radec(up_left / np.linalg.norm(up_left, axis=1)[:, None], attitude)
+    assert (ras[0], decs[0]) == pytest.approx((ra, dec), abs=1e-12)
+    east, north = (ras - ra) * np.cos(dec) / step, (decs - dec) / step
+    angles = np.arctan2(east[1:], north[1:])
+    # The sky is curved: over the step, to 2e-4.
+    assert angles == pytest.approx([position_angle, position_angle + np.pi / 2], abs=5e-4)
+
+
+def test_the_example_of_tracking_data_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    frames = []
+    for number in range(4):
+        rows = np.zeros(1, DETECTION_DTYPE)
+        rows["track_id"], rows["status"], rows["ra"], rows["dec"] = 1, 1, 0.1 + 1e-5 * number, 0.2
+        frames.append((10**18 + number * 10**9, rows))
+    code = compile(example("TrackArcs("), "docs/integration.md", "exec")
+    exec(code, {"located_detections": frames})
+    assert (tmp_path / "tracks.tdm").read_text().count("ANGLE_1 ") == 4
 
 
 def test_table_of_parameters_is_the_present_one() -> None:
