@@ -18,8 +18,11 @@ from ofsat_ros.history import PastFrame
 Array = NDArray[np.float64]
 
 # What moves less in a frame is no streak, nor what is shorter, px; a streak's half width, px.
-_WAY_PX, _LONGEST_POINT_PX, _ACROSS_PX = 6.0, 6.0, 3
-_STAR_SIGMAS = 3.0
+_WAY_PX, _LONGEST_POINT_PX, _ACROSS_PX = 2.5, 2.0, 3
+# How far beyond a streak its light reaches; what is longer is measured by this part of it, px.
+_POINT_REACH_PX, _LONGEST_STREAK_PX = 4, 300.0
+# What may be left of a star's light, in parts of it, and how much of the noise that may be.
+_STAR_LEFT, _STAR_SIGMAS = 0.1, 3.0
 # A streak must stand out from its brightest point by this, lest noise beside a point pass for one.
 _STREAK_SIGMAS = 3.0
 # What a point smoothed by 1 px is again weighted with: the narrower, the nearer to a matched
@@ -42,10 +45,11 @@ def refine(
     """Measure spots again, knowing how they move, with the star light around them subtracted.
 
     A streak is the part of the line of its motion that stands out most: of all its parts, the one
-    of the largest sum over the root of its length, the matched filter of a line.  Noise breaks a
-    faint streak into pieces; this measures the whole.  Of a point, a window follows the centroid
-    until it stays, as SExtractor's windowed positions do (Bertin and Arnouts 1996): for a Gaussian
-    source in white noise nearly as good as a fit.
+    of the largest sum over its noise, which in the smoothed image is the matched filter of a line.
+    Noise breaks a faint streak into pieces; this measures the whole, and its middle where moving
+    the part gains nothing.  Of a point, a window follows the centroid until it stays, as
+    SExtractor's windowed positions do (Bertin and Arnouts 1996): for a Gaussian source in white
+    noise nearly as good as a fit.
 
     Parameters
     ----------
@@ -85,62 +89,140 @@ def _refined_streak(
     reach: float,
 ) -> np.void | None:
     """The spot as a streak along a direction; None if it is none."""
-    along = np.arange(-np.ceil(reach), np.ceil(reach) + 1)
-    across = np.arange(-_ACROSS_PX, _ACROSS_PX + 1)
+    half = int(np.ceil(min(reach, _LONGEST_STREAK_PX))) + _POINT_REACH_PX
+    along, across = np.arange(-half, half + 1.0), np.arange(-_ACROSS_PX, _ACROSS_PX + 1.0)
     normal = np.array([-direction[1], direction[0]])
     start = np.array([spot["x"], spot["y"]])
-    points = (start + along[:, None, None] * direction + across[None, :, None] * normal).reshape(
-        -1, 2
-    )
-    inside = frame.contains(points, 1.0)
-    pixels = np.rint(points[inside]).astype(np.intp)
-    if not len(pixels):
-        return None
-    light = np.zeros(len(points))
-    light[inside] = frame.smoothed[pixels[:, 1], pixels[:, 0]]
-    if others:
-        star = star_light(frame, others, pixels).star
-        # Where a star shines, what is left of it must not pass for a streak.
-        dark = star < _STAR_SIGMAS * frame.noise
-        light[inside] = np.where(dark, light[inside] - star, 0)
+    points = start + along[:, None, None] * direction + across[None, :, None] * normal
+    light = _light_between(frame, others, points.reshape(-1, 2)).reshape(len(along), -1)
     weight = np.exp(-(across**2) / (2 * POINT_WIDTH_PX**2))
-    profile = light.reshape(len(along), -1) @ weight
-    sums = np.concatenate([[0], np.cumsum(profile)])
-    first, last = np.triu_indices(len(sums), 1)
-    length = last - first
-    usable = length <= reach + 2 * POINT_WIDTH_PX
-    merit = np.where(usable, (sums[last] - sums[first]) / np.sqrt(length), -np.inf)
-    best = int(np.argmax(merit))
-    # A point smoothed is about as long as this itself.
-    short = length <= _LONGEST_POINT_PX + 2 * POINT_WIDTH_PX
-    unit = _line_noise(weight) * frame.noise
-    gain = (merit[best] ** 2 - np.max(merit[short]) ** 2) / unit**2
-    if short[best] or gain < _STREAK_SIGMAS**2:
+    profile = _profile(light, weight)
+    first, last = _segment(profile, reach, _noise_across(weight) * frame.noise)
+    if last - first <= _LONGEST_POINT_PX:
         return None
-    part = light.reshape(len(along), -1)[first[best] : last[best]].clip(0)
-    sideways = float(part.sum(axis=0) @ across) / max(float(part.sum()), 1e-9)
-    middle = float(along[0] + (first[best] + last[best] - 1) / 2)
+    sideways = _centroid(np.nan_to_num(light[first:last]).sum(axis=0), across)
+    if abs(sideways) > _FARTHEST_PX:  # to a star beside it
+        return None
+    weight = np.exp(-((across - sideways) ** 2) / (2 * _WINDOW_VARIANCE))
+    middle = along[0] + _middle(_profile(light, weight), first, last)
     refined = spot.copy()
     refined["x"], refined["y"] = start + middle * direction + sideways * normal
-    refined["length"] = max(float(length[best]) - POINT_WIDTH_PX, 0.0)
+    refined["length"] = last - first
     refined["angle"] = np.arctan2(direction[1], direction[0])
     if refined["angle"] <= -np.pi / 2 or refined["angle"] > np.pi / 2:
         refined["angle"] -= np.copysign(np.pi, refined["angle"])
-    # Of what the border cuts, the middle is not known.
-    ends = start + (middle + np.array([[-0.5], [0.5]]) * length[best]) * direction
-    refined["refined"] = frame.contains(ends, BORDER_PX).all()
+    ends = np.array([-0.5, 0.5]) * (last - first + POINT_WIDTH_PX)
+    places = start + (middle + ends)[:, None] * direction
+    refined["refined"] = frame.contains(places, BORDER_PX).all()
+    if not refined["refined"]:
+        # Of what the border cuts, the middle is not known: the streak may be as long as the way.
+        cut = max(reach - (last - first), 0.0) / 2
+        refined["sigma_x"] = np.hypot(spot["sigma_x"], cut * direction[0])
+        refined["sigma_y"] = np.hypot(spot["sigma_y"], cut * direction[1])
     return refined
 
 
-def _line_noise(weight: Array) -> float:
-    """Std of a profile's sum over the root of its length, for smoothed noise of std 1.
+def _light_between(frame: PastFrame, others: Sequence[PastFrame], points: Array) -> Array:
+    """The light at points between pixels, (N, 2) px, less that of the stars, (N,) DN.
 
-    The profile is the sum across a line with these weights; noise smoothed by 1 px has the
-    correlation exp(-r^2/4), whose sum along a line is sqrt(4 pi).
+    NaN beside bright stars: what is left of a star must not pass for a streak.  Outside of the
+    image there is none.
+    """
+    inside = frame.contains(points, 1.0)
+    corner = np.floor(points[inside]).astype(np.intp)
+    part = points[inside] - corner
+    found = np.zeros(len(corner))
+    for x, y in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        pixels = corner + [x, y]
+        light = frame.smoothed[pixels[:, 1], pixels[:, 0]].astype(np.float64)
+        if others and len(pixels):
+            star = star_light(frame, others, pixels).star
+            light = np.where(_STAR_LEFT * star < _STAR_SIGMAS * frame.noise, light - star, np.nan)
+        found += light * np.abs(1 - x - part[:, 0]) * np.abs(1 - y - part[:, 1])
+    light = np.zeros(len(points))
+    light[inside] = found
+    return light
+
+
+def _profile(light: Array, weight: Array) -> Array:
+    """Sums across of the light, (N, M), with weights, (M,), over what is known; between, lines."""
+    known = ~np.isnan(light)
+    share = known @ weight / weight.sum()
+    sure = share > 0.5
+    if not sure.any():
+        return np.zeros(len(light))
+    sums = np.nan_to_num(light) @ weight / np.where(sure, share, 1)
+    rows = np.arange(len(light))
+    return np.interp(rows, rows[sure], sums[sure])
+
+
+def _segment(profile: Array, reach: float, unit: float) -> tuple[int, int]:
+    """First and last (not included) of the samples of a profile that stand out most together.
+
+    Of smoothed light, the sum over a segment is the matched filter of a streak of its length.
+    `unit` is the profile's noise.
+    """
+    sums = np.concatenate([[0], np.cumsum(profile)])
+    first, last = np.triu_indices(len(sums), 1)
+    length = last - first
+    # Variance of a sum of so many samples, whose correlation is exp(-r^2 / 4): each one more has
+    # its own, and twice that with all before.
+    correlation = np.exp(-(np.arange(1, len(profile)) ** 2) / 4)
+    grows = 1 + 2 * np.concatenate([[0], np.cumsum(correlation)])
+    variance = np.cumsum(grows)[length - 1]
+    merit = (sums[last] - sums[first]) / np.sqrt(variance)
+    merit[length > reach + 1] = -np.inf
+    best, short = int(np.argmax(merit)), length <= _LONGEST_POINT_PX
+    gain = (merit[best] ** 2 - np.max(merit[short]) ** 2) / unit**2
+    if gain < _STREAK_SIGMAS**2:
+        best = int(np.argmax(np.where(short, merit, -np.inf)))
+    return int(first[best]), int(last[best])
+
+
+def _middle(profile: Array, first: int, last: int) -> float:
+    """The middle of a streak, in samples: where its two ends are equally bright.
+
+    There the sum over its length is largest, the matched filter for a place between samples.
+    """
+    samples = np.arange(len(profile), dtype=float)
+    middle, half = (first + last - 1) / 2, (last - first) / 2
+    offsets = np.linspace(-_FARTHEST_PX, _FARTHEST_PX, 81)
+    ends = [np.interp(middle + offsets + end, samples, profile) for end in (half, -half)]
+    difference = ends[0] - ends[1]
+    # The sum grows while what comes in at the far end is more than what goes out.
+    sums = np.cumsum(difference)
+    at = int(np.argmax(sums))
+    if 0 < at < len(offsets) - 1:
+        before, after = difference[at], difference[at + 1]
+        if before > after:
+            return middle + offsets[at] + before / (before - after) * (offsets[1] - offsets[0])
+    return middle + offsets[at]
+
+
+def _centroid(light: Array, places: Array) -> float:
+    """Centroid of a profile of a point, as `_centroids`, from the middle."""
+    place = 0.0
+    gain = 1 + POINT_WIDTH_PX**2 / _WINDOW_VARIANCE
+    for _ in range(8):
+        weight = light * np.exp(-((places - place) ** 2) / (2 * _WINDOW_VARIANCE))
+        total = weight.sum()
+        if total <= 0:
+            break
+        step = gain * float(weight @ (places - place)) / total
+        place = float(np.clip(place + step, places[0], places[-1]))
+        if abs(step) < _STILL_PX:
+            break
+    return place
+
+
+def _noise_across(weight: Array) -> float:
+    """Std of a sum across with these weights, of smoothed noise of std 1.
+
+    Noise smoothed by 1 px has the correlation exp(-r^2/4).
     """
     offset = np.arange(len(weight))
     correlation = np.exp(-((offset[:, None] - offset) ** 2) / 4)
-    return float(np.sqrt(weight @ correlation @ weight * np.sqrt(4 * np.pi)))
+    return float(np.sqrt(weight @ correlation @ weight))
 
 
 def _refined_points(
