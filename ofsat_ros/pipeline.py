@@ -36,7 +36,7 @@ _SMALLEST_SIDE = 16
 _DTYPES = ("uint8", "uint16", "float32")
 # Where a track is expected, a closer look finds what is a spot of this many sigmas, this near, px.
 _CLOSER_SIGMAS, _CLOSER_PX = 2.0, 2
-# Frames in a row over which the field's motion is taken to go on when no star shows it.
+# Frames in a row over which the field's motion is taken to go on when too few stars show it.
 _BLIND_FRAMES = 3
 # Images that were preprocessed differently cannot be compared.
 _PREPROCESSING = [p.name for p in Parameters.describe() if p.stage == "preprocessing"]
@@ -153,7 +153,8 @@ class Pipeline:
         self._settled: list[Settled] = []
         # The smoothed image of a frame that has left the history: fresh memory costs time.
         self._spare: NDArray[np.float32] | None = None
-        self._last_motion: StarFieldMotion | None = None
+        # The field's last motion, per second.
+        self._field_rate: StarFieldMotion | None = None
         self._blind = 0
         self._reset_reason = "first frame"
         self._frames = 0
@@ -175,7 +176,7 @@ class Pipeline:
         """End all tracks and drop the history; the last word on it goes with the next frame."""
         self._settled += self._tracker.clear(self._history)
         self._history.clear()
-        self._last_motion = None
+        self._field_rate = None
 
     def process(self, image: NDArray[np.generic], stamp_ns: int) -> FrameResult:
         """Process the next image.
@@ -277,11 +278,11 @@ class Pipeline:
             self.reset(f"{' and '.join(changed)} changed")
         return self._previous
 
-    @staticmethod
     def _compare(
-        previous: _Previous, current: FlowInput, result: FrameResult, parameters: Parameters
+        self, previous: _Previous, current: FlowInput, result: FrameResult, parameters: Parameters
     ) -> None:
         """Fill in flow, star field and detections."""
+        expected = self._field_rate and self._field_rate.over(result.dt_s)
         guesses = np.zeros((1, 2))
         if parameters.first_guess == "field":
             with _timed(result.seconds, "star_field"):
@@ -291,6 +292,9 @@ class Pipeline:
                     current.xy,
                     result.objects["flux"],
                 )
+            if shift is None and expected is not None:
+                # Too few votes to tell from chance: a mount most likely goes on as it did.
+                shift = expected.displacement
             if shift is not None:
                 # No motion comes second: in rate tracking the RSOs stand still.
                 guesses = np.stack([shift, np.zeros(2)])
@@ -308,7 +312,7 @@ class Pipeline:
                 parameters.star_field_model,
                 parameters.outlier_sigmas,
             )
-        if motion is None:
+        if motion is None or not motion.is_credible(expected):
             return
         inliers = np.zeros(len(flow), bool)
         inliers[valid] = motion.inliers
@@ -348,8 +352,11 @@ class Pipeline:
         if self._blind > _BLIND_FRAMES:
             # Where the stars went meanwhile is not known: what follows is another sky.
             self._forget()
-        self._last_motion = motion or self._last_motion
-        to_sky = self._history.place(self._last_motion)
+        if motion is not None:
+            self._field_rate = motion.over(1 / result.dt_s)
+        elif self._field_rate is not None:
+            motion = self._field_rate.over(result.dt_s)
+        to_sky = self._history.place(motion)
         full = len(self._history) == self._history.length
         self._spare = self._history[0].smoothed if full else None
         self._history.add(

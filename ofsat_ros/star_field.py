@@ -22,6 +22,9 @@ _VOTE_CELLS = 512
 _STARS_FOR_SIMILARITY = 6
 # Of so many vectors, this part at least must share a motion that is the field's.
 _MANY_VECTORS, _LEAST_SHARE = 20, 0.1
+# A motion further than this from the expected one, px, needs so many stars, or that part of those
+# that showed the expected one: an RSO that the mount follows and wrong vectors make two or three.
+_OTHER_PX, _ENOUGH_STARS, _ENOUGH_SHARE = 5.0, 5, 0.5
 # Cut of Tukey's biweight, in sigmas: 95 % efficiency on Gaussian errors.
 _TUKEY = 4.685
 # The fit has converged when no vector of the field changes by more than this, px.
@@ -81,6 +84,24 @@ class StarFieldMotion:
     def with_inliers(self, inliers: NDArray[np.bool_]) -> StarFieldMotion:
         """Return the same motion with the inliers of another, longer, set of vectors."""
         return replace(self, inliers=inliers)
+
+    def over(self, times: float) -> StarFieldMotion:
+        """Return the motion that goes on evenly for so many times as long."""
+        return replace(
+            self,
+            displacement=self.displacement * times,
+            rotation=self.rotation * times,
+            scale=self.scale * times,
+            covariance=self.covariance * times**2,
+            speed_mean=self.speed_mean * times,
+            speed_std=self.speed_std * times,
+        )
+
+    def is_credible(self, expected: StarFieldMotion | None) -> bool:
+        """Whether it is about the expected motion, if any, or enough stars show another."""
+        if expected is None or np.hypot(*(self.displacement - expected.displacement)) <= _OTHER_PX:
+            return True
+        return self.star_count >= min(_ENOUGH_STARS, _ENOUGH_SHARE * expected.star_count)
 
     def displacement_at(self, xy: Array) -> Array:
         """Displacement of the field at points (N, 2) px of the current frame, (N, 2) px."""

@@ -3,9 +3,11 @@
 import functools
 import math
 import re
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from blobs import blobs, camera
 
 from ofsat_ros.detection import CONFIRMED
 from ofsat_ros.parameters import Parameters, preset_names
@@ -755,6 +757,95 @@ def test_when_the_field_is_lost_for_longer_all_starts_afresh():
     assert [one.frame for one in settled] == list(range(13))
     for one in settled:
         assert len(one.detections) == (0 if one.frame in hidden else 3), one.frame
+
+
+FAST = np.array((36.0, -18.0))
+FOLLOWED = np.array((128.0, 127.0))
+
+
+def followed(number: int, gone: np.ndarray, rso: np.ndarray, brightest: int) -> np.ndarray:
+    """Stars of SNR 8 to 80 that have gone so far, px, since the first frame, and an RSO.
+
+    A cloud leaves only so many of the stars in the image, the brightest ones.
+    """
+    places = np.random.default_rng(12).uniform(-600, 856, (1000, 2)) + gone
+    flux = np.geomspace(60_000, 6_000, len(places))
+    inside = np.flatnonzero(np.all((places > -10) & (places < SIZE + 10), axis=1))[:brightest]
+    places, flux = np.vstack([places[inside], rso]), np.append(flux[inside], 30_000)
+    return camera(blobs((SIZE, SIZE), places, flux, 1.2), np.random.default_rng(number), noise=40)
+
+
+def follow(
+    steps: list[np.ndarray], clouds: dict[int, int], seconds: dict[int, float]
+) -> Iterator[FrameResult]:
+    """Yield results of frames before which the stars went so far, 1 s apart or as said.
+
+    The RSO, which moves evenly on the sky, is found where it is, and is the first track still.
+    """
+    pipeline, gone, now_s = Pipeline(), np.zeros(2), 0.0
+    for number, step in enumerate(steps):
+        gone, now_s = gone + step, now_s + seconds.get(number, 1.0)
+        rso = FOLLOWED + gone - FAST * now_s
+        image = followed(number, gone, rso, clouds.get(number, 1000))
+        result = pipeline.process(image, START_NS + round(now_s * 1e9))
+        if number >= 3:
+            assert result.tracks["track_id"].tolist() == [1], number
+            # 1.8 px / SNR of about 70 and what star light behind it adds; a step is 40 px
+            place = columns(result.tracks, "x", "y")[0]
+            assert place == pytest.approx(rso, abs=0.5), number
+        yield result
+
+
+@pytest.mark.parametrize("seen", [4, 5, 6])
+def test_few_fast_stars_are_sought_where_the_mount_led_so_far(seen: int):
+    """They are too few for a vote of their own, and the RSO stands still before them."""
+    for result in follow([FAST] * 10, {6: seen, 7: seen}, {}):
+        if result.frame:
+            # some ten stars of 0.1 px each, or three
+            assert result.star_field.displacement == pytest.approx(FAST, abs=0.3), result.frame
+
+
+@pytest.mark.parametrize("hidden", [1, 2])
+def test_an_rso_that_is_followed_is_no_star_field(hidden: int):
+    """Alone in the image, it is where it was, and the unseen stars go on as they did."""
+    clouds = {6 + i: 0 for i in range(hidden)}
+    for result in follow([FAST] * 10, clouds, {}):
+        if result.frame in clouds or result.frame - 1 in clouds:
+            assert result.star_field is None
+        elif result.frame:
+            assert result.star_field.displacement == pytest.approx(FAST, abs=0.3)
+
+
+def test_unseen_stars_go_on_for_as_long_as_the_stamps_say():
+    steps, seconds = [FAST] * 10, {6: 1.5, 7: 0.7}
+    for number, dt in seconds.items():
+        steps[number] = FAST * dt
+    for result in follow(steps, {6: 0}, seconds):
+        if result.frame >= 3:
+            # The history puts the RSO on the sky, where it moves against the stars.
+            rate = columns(result.tracks, "rel_vx", "rel_vy")[0]
+            assert rate == pytest.approx(-FAST, abs=0.5), result.frame
+
+
+@pytest.mark.parametrize(
+    "new", [(0.0, 0.0), (-21.0, 13.0), (60.0, 2.0)], ids=["stops", "turns", "speeds up"]
+)
+def test_another_motion_that_many_stars_show_is_taken_at_once(new: tuple[float, float]):
+    for result in follow([FAST] * 6 + [np.array(new)] * 2, {}, {}):
+        if result.frame:
+            truth = FAST if result.frame < 6 else new
+            assert result.star_field.displacement == pytest.approx(truth, abs=0.3), result.frame
+
+
+def test_three_stars_are_a_field_from_the_first_frames_on_and_when_they_stop():
+    places, pipeline, step = np.array([(40.0, 60), (90, 190), (150, 80)]), Pipeline(), (5.5, 3.0)
+    for frame in range(9):
+        gone = np.array(step) * min(frame, 5)
+        result = pipeline.process(sky(*(places + gone), seed=frame), stamp(frame))
+        if frame:
+            truth = step if frame <= 5 else (0, 0)
+            assert result.star_field.star_count >= 3
+            assert result.star_field.displacement == pytest.approx(truth, abs=0.2)
 
 
 @pytest.mark.parametrize(("before", "after"), [(9, 4), (4, 9), (4, 3), (3, 4), (9, 3)])

@@ -221,6 +221,40 @@ def test_with_inliers_changes_nothing_else():
     np.testing.assert_array_equal(other.displacement, motion.displacement)
 
 
+def test_a_motion_goes_on_evenly():
+    motion = estimate(*vectors(np.random.default_rng(9), 30))
+    twice = motion.over(2.0)
+    points = np.array([[0.0, 0.0], [599, 399], [299.5, 199.5]])
+    assert twice.displacement_at(points) == pytest.approx(2 * motion.displacement_at(points))
+    assert twice.variance_at(points) == pytest.approx(4 * motion.variance_at(points))
+    speeds = twice.speed_mean, twice.speed_std
+    assert speeds == pytest.approx((2 * motion.speed_mean, 2 * motion.speed_std))
+    assert twice.star_count == motion.star_count
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "moved", "credible"),
+    [
+        (15, 3, 40.0, False),  # the RSO that is followed, and two wrong vectors
+        (15, 2, 4.0, True),  # few, but as expected
+        (15, 5, 40.0, True),  # five do not agree by chance
+        (3, 3, 40.0, True),  # few stars throughout
+        (6, 3, 40.0, True),
+        (7, 3, 40.0, False),
+        (3, 1, 40.0, False),
+    ],
+)
+def test_another_motion_than_expected_needs_stars(before, now, moved, credible):
+    rng = np.random.default_rng(11)
+    expected, motion = (
+        estimate(*vectors(rng, count, 0.05, [*shift, 0, 0]))
+        for count, shift in ((before, (36, -18)), (now, (36 - moved, -18)))
+    )
+    assert (expected.star_count, motion.star_count) == (before, now)
+    assert motion.is_credible(expected) is credible
+    assert motion.is_credible(None) is True
+
+
 # --- first guess ------------------------------------------------------------------------------
 
 
