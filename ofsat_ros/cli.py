@@ -136,7 +136,7 @@ def process(
             frames = stack.enter_context(
                 open_recording(recording, topic, camera_info_topic, attitude_topic)
             )
-            _claim(output, [*made, *(TRACKING_DATA[name] for name in formats)], force)
+            _claim(output, [*made, *TRACKING_DATA.values()], force)
             writer = stack.enter_context(ResultWriter(output))
             try:
                 processing.run(frames, writer)
@@ -274,6 +274,9 @@ def _claim(folder: Path, files: list[str], force: bool) -> None:
             f"{folder} already holds {', '.join(old)}; choose another folder, or --force to"
             " replace them"
         )
+    # What is not made this time must not stay beside what is.
+    for name in old:
+        (folder / name).unlink()
 
 
 def _fail(error: Exception | str) -> NoReturn:

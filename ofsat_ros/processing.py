@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from ofsat_ros.camera import Astrometry
+from ofsat_ros.camera import Astrometry, Camera
 from ofsat_ros.pipeline import FrameResult, ImageError, Pipeline
 from ofsat_ros.recordings import Attitude, Frame, Recording
 from ofsat_ros.results import ResultWriter, in_words
@@ -103,9 +103,11 @@ class Processing:
         self._arcs, self._live, self._say = arcs, live, say
         self._writer: ResultWriter
         self._refused = 0
-        self._misfit = False
-        # Numbers in the recording, which count those that could not be decoded, by the pipeline's.
-        self._numbers: dict[int, int] = {}
+        self._misfit = self._calibrated = False
+        # Of each frame by the pipeline's number: that in the recording, which counts those that
+        # could not be decoded, too, and its calibration.
+        self._frames: dict[int, tuple[int, Camera | None]] = {}
+        self._settled: list[Settled] = []  # until the attitudes after their frames are known
 
     def run(self, frames: Recording, writer: ResultWriter) -> None:
         """Process every frame; what was done is written whatever ends it.
@@ -128,20 +130,22 @@ class Processing:
         finally:
             # Also when stopped or torn off: what was seen is not lost.
             with totals.timed("the last frames' last word"):
-                self._write_settled(self._pipeline.finish())
+                self._settled += self._pipeline.finish()
+                self._write_settled()
             totals.reading_s = frames.seconds
         totals.left_out = self._refused + frames.skipped
         for problem in frames.problems:
             self._say(f"note: {problem}")
         # Most cameras are not calibrated, and nobody misses directions then.
-        wanted = self._arcs is not None or self._astrometry.camera is not None
+        wanted = self._arcs is not None or self._calibrated
         for why, count in totals.unlocated.items() if wanted else ():
             self._say(f"note: {count} detections have no ra and dec: {why}")
 
     def _take(self, frame: Frame) -> None:
         totals = self.totals
-        self._calibrate(frame)
+        camera = self._camera_of(frame)
         self._add_attitudes(frame.attitudes)
+        self._write_settled()
         try:
             with totals.timed("other") as stages:
                 middle_ns = self._astrometry.middle_ns(frame.stamp_ns)
@@ -154,13 +158,13 @@ class Processing:
             return
         if result.reset and totals.frames:
             self._say(f"note: frame {frame.number} starts afresh: {result.reset}")
-        self._numbers[result.frame] = frame.number
+        self._frames[result.frame] = frame.number, camera
         with totals.timed("writing"):
             self._write(result)
         totals.frames += 1
         totals.reason = result.reason
 
-    def _calibrate(self, frame: Frame) -> None:
+    def _camera_of(self, frame: Frame) -> Camera | None:
         camera, (height, width) = frame.camera, frame.image.shape
         if camera is not None and (camera.height, camera.width) != (height, width):
             if not self._misfit:
@@ -169,32 +173,38 @@ class Processing:
                     f"note: camera_info is for images of {camera.width}x{camera.height}, not of"
                     f" {width}x{height}: directions are unknown"
                 )
-            camera = None
-        self._astrometry.camera = camera
+            return None
+        if camera is not None and not self._calibrated:
+            # The first calibration often comes with the first image, and after it.
+            self._calibrated = True
+            self._frames = {key: (number, camera) for key, (number, _) in self._frames.items()}
+        return camera
 
     def _add_attitudes(self, attitudes: tuple[Attitude, ...]) -> None:
         for stamp_ns, rotation in attitudes:
             self._astrometry.add_attitude(stamp_ns, rotation)
 
     def _write(self, result: FrameResult) -> None:
-        number = self._numbers[result.frame]
+        number, _ = self._frames[result.frame]
         self._writer.add_star_field(replace(result, frame=number))
         if self._live:
-            self._write_detections(result.stamp_ns, number, result.detections)
-        self._write_settled(result.settled)
+            self._write_detections(result.stamp_ns, result.frame, result.detections)
+        self._settled += result.settled
 
-    def _write_settled(self, settled: list[Settled]) -> None:
+    def _write_settled(self) -> None:
+        settled, self._settled = self._settled, []
         for last in settled:
             # A frame in which an error ended all is in the history, but was not answered.
-            number = self._numbers.pop(last.frame, None)
-            if number is not None and not self._live:
-                self._write_detections(last.stamp_ns, number, last.detections)
+            if last.frame in self._frames and not self._live:
+                self._write_detections(last.stamp_ns, last.frame, last.detections)
+            self._frames.pop(last.frame, None)
 
     def _write_detections(self, stamp_ns: int, frame: int, detections: Detections) -> None:
+        number, self._astrometry.camera = self._frames[frame]
         why = self._astrometry.locate(detections, stamp_ns)
         if why and len(detections):
             self.totals.unlocated[why] += len(detections)
-        self._writer.add_detections(stamp_ns, frame, detections)
+        self._writer.add_detections(stamp_ns, number, detections)
         if self._arcs is not None:
             self._arcs.add(stamp_ns, detections)
         self.totals.detections.update(detections["track_id"].tolist())

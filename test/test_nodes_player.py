@@ -144,6 +144,21 @@ def test_calibration_and_attitude_go_out_in_the_recorded_order(tmp_path, stop):
     assert attitudes[0].quaternion.w == 1.0
 
 
+def test_a_later_start_begins_with_the_calibration_that_holds(tmp_path, stop):
+    with BagWriter(tmp_path / "bag") as writer:
+        for scale, at_ns in ((1e-4, TIMES[0]), (2e-4, TIMES[1])):
+            camera = Camera.ideal(16, 16, scale)
+            writer.write_camera_info("/cam/camera_info", camera, at_ns, "cam")
+        for at_ns in TIMES[:6]:
+            writer.write_image("/cam/image", np.zeros((16, 16), np.uint8), at_ns, "cam")
+    with Graph("-p", "rate:=20.0", "-p", "start_s:=1.1") as graph:
+        graph.add(Player(stop, f"{tmp_path / 'bag'}", context=graph.context))
+        infos = graph.listen(CameraInfo, "/cam/camera_info")
+        images = graph.listen(Image, "/cam/image")
+        graph.until(lambda: len(images) == 3 and infos)
+    assert [info.k[0] for info in infos] == [pytest.approx(5000)]
+
+
 def test_replay_waits_for_the_answers_of_a_detector(bag, stop):
     with Graph("-p", "rate:=0") as graph:
         answers = graph.publisher(PointCloud2, "rso_detections")

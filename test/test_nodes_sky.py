@@ -5,6 +5,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import QuaternionStamped
 from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from ros_graph import Graph
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
@@ -41,8 +42,8 @@ class Camera:
         self.tracks = graph.listen(PointCloud2, "rso_tracks")
         self.states = graph.listen(DiagnosticArray, "/diagnostics")
         self.image = graph.publisher(Image, "image")
-        self.info = graph.publisher(CameraInfo, "camera_info", best_effort=True)
-        self.attitude = graph.publisher(QuaternionStamped, "attitude", best_effort=True)
+        self.info = graph.publisher(CameraInfo, "camera_info")
+        self.attitude = graph.publisher(QuaternionStamped, "attitude")
         graph.connect(self.image, self.info, self.attitude)
 
     def calibrate(self, width: int = WIDTH, focal_px: float = FOCAL_PX) -> None:
@@ -197,6 +198,19 @@ def test_a_calibration_that_does_not_count_is_said(camera, calibration, level, w
     state = camera.state(5)
     assert state.level == level
     assert words in _values(state)["directions"]
+
+
+def test_a_calibration_that_was_said_once_before_is_heard():
+    """By a sender that keeps it for those who come later."""
+    with Graph("-p", "reliable_input:=true") as graph:
+        qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        once = graph.probe.create_publisher(CameraInfo, "camera_info", qos)
+        info = CameraInfo(width=WIDTH, height=HEIGHT, distortion_model="plumb_bob")
+        info.k = [FOCAL_PX, 0.0, 80.0, 0.0, FOCAL_PX, 60.0, 0.0, 0.0, 1.0]
+        once.publish(info)
+        camera = Camera(graph, graph.add(Detector(graph.context)))
+        rows = run(camera, point_ms=())[-1]
+        assert np.isfinite(rows["sight"]).all()
 
 
 def test_an_attitude_that_is_no_rotation_is_left_out(camera):

@@ -129,6 +129,46 @@ def test_directions_that_are_unknown_are_nan_and_said(kinds, note, tmp_path):
     assert note in words if note else words == ""
 
 
+def test_each_frame_has_the_calibration_of_its_time(tmp_path):
+    """A focuser moved in mid-recording: the last word on the frames before comes after that."""
+    frames = list(scenario("survey", 1, frames=FRAMES, **SIZE))
+    start_ns, changed = frames[0].stamp_ns, FRAMES // 2
+    with BagWriter(tmp_path / "bag") as bag:
+        for frame in frames:
+            scale = SCALE_RAD * (1 if frame.frame < changed else 1.1)
+            camera = Camera.ideal(SIZE["width"], SIZE["height"], scale)
+            bag.write_camera_info(INFO, camera, frame.stamp_ns, FRAME_ID)
+            for at_ns in (frame.stamp_ns - 1_000_000, frame.stamp_ns):
+                bag.write_attitude(ATTITUDE, attitude_at(at_ns, start_ns), at_ns, FRAME_ID)
+            bag.write_image(IMAGE, frame.image, frame.stamp_ns, FRAME_ID)
+    _, rows = process(tmp_path / "bag", tmp_path / "out")
+    assert len({int(row["frame"]) >= changed for row in rows}) == 2
+    for row in rows:
+        ra, dec = np.radians([float(row["ra_deg"]), float(row["dec_deg"])])
+        icrs = [np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]
+        sight = attitude_at(int(row["stamp_ns"]), start_ns).apply(icrs)
+        expected = gnomonic(float(row["x_px"]), float(row["y_px"]))
+        if int(row["frame"]) >= changed:
+            expected[:2] *= 1.1
+            expected /= np.linalg.norm(expected)
+        assert np.linalg.norm(sight - expected) < 5e-8
+
+
+def test_an_attitude_right_after_the_image_counts_with_published_presets_too(tmp_path):
+    """Their last word is said at once; the attitude's message comes a moment later."""
+    frames = list(scenario("survey", 1, frames=4, **SIZE))
+    with BagWriter(tmp_path / "bag") as bag:
+        for frame in frames:
+            camera = Camera.ideal(SIZE["width"], SIZE["height"], SCALE_RAD)
+            bag.write_camera_info(INFO, camera, frame.stamp_ns, FRAME_ID)
+            bag.write_image(IMAGE, frame.image, frame.stamp_ns, FRAME_ID)
+            attitude = attitude_at(frame.stamp_ns, frames[0].stamp_ns)
+            bag.write_attitude(ATTITUDE, attitude, frame.stamp_ns, FRAME_ID)
+    _, rows = process(tmp_path / "bag", tmp_path / "out", "--preset", "paper_opencv")
+    assert len(rows) > 3
+    assert "nan" not in {row["ra_deg"] for row in rows}
+
+
 def test_an_old_attitude_does_not_count(bag, tmp_path):
     """The nearest attitude is 0.2 s before each frame; two are 0.4 s apart."""
     _, rows = process(bag, tmp_path / "out", "--attitude-max-age-s", 0.15, "--live")
@@ -165,3 +205,6 @@ def test_tracking_data_are_not_overwritten_unless_told(bag, tmp_path):
     assert (tmp_path / "tracks.tdm").read_text() == "precious"
     assert CliRunner().invoke(main, [*command, "--force"]).exit_code == 0
     assert (tmp_path / "tracks.tdm").read_text().startswith("CCSDS_TDM_VERS")
+    # Without tracking data, none of another run's stays beside the new results.
+    assert CliRunner().invoke(main, [*command[:-2], "--force"]).exit_code == 0
+    assert not (tmp_path / "tracks.tdm").exists()

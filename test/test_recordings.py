@@ -810,6 +810,22 @@ def test_which_calibration_and_attitude_are_read(tmp_path, topics, options, used
     assert len(frame.attitudes) == 1
 
 
+def test_another_cameras_calibration_is_not_taken(tmp_path):
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.write_camera_info("/left/camera_info", camera_of(), FIRST_NS, FRAME_ID)
+        for side in ("left", "right"):
+            bag.write_image(f"/{side}/image_raw", scene(0), FIRST_NS, FRAME_ID)
+    with open_recording(tmp_path / "bag", "/right/image_raw") as recording:
+        (frame,) = recording
+        (problem,) = recording.problems
+    assert frame.camera is None
+    assert problem.startswith("/left/camera_info is beside another image topic")
+    options = {"topic": "/right/image_raw", "camera_info_topic": "/left/camera_info"}
+    with open_recording(tmp_path / "bag", **options) as recording:
+        (frame,) = recording
+    assert frame.camera is not None
+
+
 def test_among_several_calibrations_none_is_guessed(tmp_path):
     with BagWriter(tmp_path / "bag") as bag:
         for topic in ("/left/camera_info", "/right/camera_info"):

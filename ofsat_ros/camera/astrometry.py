@@ -14,6 +14,8 @@ from ofsat_ros.parameters import CameraParameters
 Array = NDArray[np.float64]
 
 _NS = 1_000_000_000
+# Attitudes come out of order by less, ns; by more, time has run backwards.
+_DISORDER_NS = 1_000_000_000
 # An attitude whose stamp differs by less is that of the frame itself.
 _SAME_NS = 1_000_000
 # How far from 1 the norm of a quaternion may be that was sent with few digits.
@@ -51,7 +53,14 @@ class Attitudes:
         self._quaternions: list[list[float]] = []
 
     def add(self, stamp_ns: int, attitude: Rotation) -> None:
-        """Take an attitude, in any order; one of the same stamp replaces the former."""
+        """Take an attitude; one of the same stamp replaces the former.
+
+        They may come a little out of order.  One that is over 1 s older than the newest tells
+        that time has run backwards, or that the newest had a wrong stamp: all are forgotten.
+        """
+        if self._stamps and stamp_ns < self._stamps[-1] - _DISORDER_NS:
+            self._stamps.clear()
+            self._quaternions.clear()
         place = bisect_left(self._stamps, stamp_ns)
         if self._stamps[place : place + 1] != [stamp_ns]:
             self._stamps.insert(place, stamp_ns)

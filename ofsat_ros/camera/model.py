@@ -141,15 +141,18 @@ class Camera:
         """
         k, d = (getattr(message, name, getattr(message, name.upper(), ())) for name in "kd")
         roi = message.roi
-        return cls.from_calibration(
-            message.width,
-            message.height,
-            k,
-            d,
-            message.distortion_model,
-            binning=(message.binning_x, message.binning_y),
-            roi=(roi.x_offset, roi.y_offset, roi.width, roi.height),
-        )
+        try:
+            return cls.from_calibration(
+                message.width,
+                message.height,
+                k,
+                d,
+                message.distortion_model,
+                binning=(message.binning_x, message.binning_y),
+                roi=(roi.x_offset, roi.y_offset, roi.width, roi.height),
+            )
+        except (OverflowError, np.linalg.LinAlgError) as error:
+            raise CameraError(f"the calibration's values are absurd: {error}") from error
 
     @classmethod
     def ideal(cls, width: int, height: int, pixel_scale_rad: float) -> Self:

@@ -133,7 +133,7 @@ def _light_between(frame: PastFrame, others: Sequence[PastFrame], points: Array)
     part = points[inside] - corner
     found = np.zeros(len(corner))
     for x, y in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        pixels = corner + [x, y]
+        pixels = corner + np.array([x, y], np.intp)
         light = frame.smoothed[pixels[:, 1], pixels[:, 0]].astype(np.float64)
         if others and len(pixels):
             star = star_light(frame, others, pixels).star

@@ -83,7 +83,7 @@ class Detector(Node):
         )
         own = self._settings[DetectorParameters]
         self._pipeline = Pipeline(self._settings[Parameters])
-        self._sky = Sky(self, self._settings[CameraParameters])
+        self._sky = Sky(self, self._settings[CameraParameters], own.reliable_input)
         self._reset_wanted = ""
         backlog_s = None if own.reliable_input else own.backlog_s
         self._inbox = Inbox(own.queue_depth, backlog_s)

@@ -50,6 +50,8 @@ _TYPES_BESIDE = {CAMERA_INFO: CameraInfo, ATTITUDE: QuaternionStamped}
 # Frames that may be on their way: kept by the middleware until received, or not yet answered.
 _DEPTH = 10
 _UNANSWERED = 4
+# Small messages beside the images that may be on their way.
+_BESIDE_DEPTH = 50
 _NS = 1_000_000_000
 _POLL_S = 0.02
 _CLOCK_PERIOD_S = 0.025
@@ -98,7 +100,7 @@ class Player(Node):
         topics = _image_topics(self._bag, own.topic)
         self._publishers_of = {name: self._publisher(name) for name in topics}
         self._beside = {
-            name: self._publisher(name)
+            name: self._publisher(name, _BESIDE_DEPTH)
             for name, about in self._bag.topics.items()
             if about.msgtype in _TYPES_BESIDE
         }
@@ -124,10 +126,10 @@ class Player(Node):
         if not self._thread.is_alive():
             self._bag.close()
 
-    def _publisher(self, name: str) -> Publisher:
+    def _publisher(self, name: str, depth: int = _DEPTH) -> Publisher:
         kind = (_TYPES | _TYPES_BESIDE)[self._bag.topics[name].msgtype]
         return self.create_publisher(
-            kind, name, reliable(_DEPTH), qos_overriding_options=overridable_qos()
+            kind, name, reliable(depth), qos_overriding_options=overridable_qos()
         )
 
     def _on_answer(self, cloud: PointCloud2) -> None:
@@ -179,6 +181,7 @@ class Player(Node):
         start_ns = self._bag.start_ns + round(own.start_s * _NS)
         count, last_ns, due_s = 0, None, time.monotonic()
         topics = [*self._publishers_of, *self._beside]
+        beside = self._play_calibrations_before(start_ns) if own.start_s else 0
         for topic, _, time_ns, data in self._bag.messages(topics, start_ns):
             last_ns = time_ns if last_ns is None else last_ns
             due_s = self._wait_until_due(last_ns, time_ns, due_s)
@@ -187,6 +190,9 @@ class Player(Node):
                 break
             if topic in self._beside:
                 self._beside[topic].publish(bytes(data))
+                beside += 1
+                if beside % _BESIDE_DEPTH == 0:
+                    self._wait_for_receipt()
                 continue
             self._wait_for_answers(_UNANSWERED - 1)
             if self._stop.is_set():
@@ -200,6 +206,18 @@ class Player(Node):
             raise RecordingError(
                 f"{self._bag.path} holds no image after start_s = {own.start_s:g} s"
             )
+
+    def _play_calibrations_before(self, start_ns: int) -> int:
+        """Play each calibration that holds at a time; return how many these are."""
+        topics = [n for n in self._beside if self._bag.topics[n].msgtype == CAMERA_INFO]
+        last: dict[str, bytes] = {}
+        for topic, _, time_ns, data in self._bag.messages(topics):
+            if time_ns >= start_ns or self._stop.is_set():
+                break
+            last[topic] = bytes(data)
+        for topic, data in last.items():
+            self._beside[topic].publish(data)
+        return len(last)
 
     def _wait_until_due(self, last_ns: int, time_ns: int, due_s: float) -> float:
         """Wait until a message's time has come; return when that was.  Advances the clock."""
@@ -262,7 +280,7 @@ class Player(Node):
 
     def _wait_for_receipt(self) -> None:
         """Wait until every reliable subscriber has received all: nothing is overwritten."""
-        for publisher in self._publishers_of.values():
+        for publisher in (*self._publishers_of.values(), *self._beside.values()):
             while not self._stop.is_set():
                 if publisher.wait_for_all_acked(Duration(seconds=_POLL_S)):
                     break

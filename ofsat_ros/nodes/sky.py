@@ -10,8 +10,9 @@ import threading
 
 import numpy as np
 from geometry_msgs.msg import QuaternionStamped
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
 
@@ -21,7 +22,7 @@ from ofsat_ros.nodes.runtime import overridable_qos
 from ofsat_ros.parameters import CameraParameters
 
 # Small messages, of which one thread may be late in taking many.
-_DEPTH = 100
+_DEPTH = 1000
 _WARN_EVERY_S = 10.0
 
 
@@ -31,25 +32,48 @@ class Sky:
     Parameters
     ----------
     node : Node
-        Subscribes to ``camera_info`` and ``attitude``; best effort, which hears every sender.
+        Subscribes to ``camera_info`` and ``attitude``.
     parameters : CameraParameters
+    reliable_input : bool
+        Ask for reliable delivery, as for the images; else best effort, which hears every sender.
     """
 
-    def __init__(self, node: Node, parameters: CameraParameters) -> None:
+    def __init__(self, node: Node, parameters: CameraParameters, reliable_input: bool) -> None:
         self._node = node
         self._lock = threading.Lock()
         self._astrometry = Astrometry(parameters)
         self._info: CameraInfo | None = None
         self._uncalibrated = "no camera_info has come"
         self._has_attitude = False
-        qos = QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-        for kind, topic, take in (
-            (CameraInfo, "camera_info", self._on_camera_info),
-            (QuaternionStamped, "attitude", self._on_attitude),
-        ):
-            node.create_subscription(
-                kind, topic, take, qos, qos_overriding_options=overridable_qos()
-            )
+        kind = ReliabilityPolicy.RELIABLE if reliable_input else ReliabilityPolicy.BEST_EFFORT
+        qos = QoSProfile(depth=_DEPTH, reliability=kind)
+        node.create_subscription(
+            CameraInfo,
+            "camera_info",
+            self._on_camera_info,
+            qos,
+            qos_overriding_options=overridable_qos(),
+        )
+        node.create_subscription(
+            QuaternionStamped,
+            "attitude",
+            self._on_attitude,
+            qos,
+            qos_overriding_options=overridable_qos(),
+        )
+        # Some senders say a calibration once, and keep it for those who come later.  Others are
+        # heard above: that they don't keep it is no fault.
+        node.create_subscription(
+            CameraInfo,
+            "camera_info",
+            self._on_camera_info,
+            QoSProfile(
+                depth=1,
+                reliability=ReliabilityPolicy.RELIABLE,
+                durability=DurabilityPolicy.TRANSIENT_LOCAL,
+            ),
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+        )
 
     def set_parameters(self, parameters: CameraParameters) -> None:
         """Take new parameters, from the next frame on."""
@@ -103,7 +127,8 @@ class Sky:
             camera = Camera.from_message(info)
         except CameraError as error:
             why = f"camera_info: {error}"
-            self._node.get_logger().info(f"{why}; directions are unknown")
+            if why != self._uncalibrated:
+                self._node.get_logger().info(f"{why}; directions are unknown")
         with self._lock:
             self._info, self._uncalibrated = info, why
             self._astrometry.camera = camera

@@ -269,6 +269,7 @@ class Recording:
         try:
             message = self._bag.deserialize(data, msgtype)
             if msgtype == CAMERA_INFO:
+                self._camera = None  # if the new one is useless, the old one is, too
                 self._camera = Camera.from_message(message)
             else:
                 q, stamp = message.quaternion, message.header.stamp
@@ -340,11 +341,22 @@ def _choose_beside(bag: Bag, image: str, msgtype: str, name: str, wanted: str | 
             listing = ", ".join(found) or "none"
             raise RecordingError(f"{bag.path}: {wanted} is no {msgtype} topic; there is {listing}")
         return wanted
-    beside = f"{image.removesuffix('/compressed').rpartition('/')[0]}/{name}"
+    beside = f"{_namespace(image)}/{name}"
     if beside in found:
         return beside
+    others = {_namespace(topic) for topic, about in bag.topics.items() if about.is_image}
+    if len(found) == 1 and _namespace(found[0]) in others - {_namespace(image)}:
+        bag.problems.append(
+            f"{found[0]} is beside another image topic than {image}, and is not used: choose it"
+            f" as the topic of the {name} if it is this camera's"
+        )
+        return ""
     if len(found) > 1:
         bag.problems.append(
             f"several topics are {msgtype}, and none is {beside}; none is used: {', '.join(found)}"
         )
     return found[0] if len(found) == 1 else ""
+
+
+def _namespace(topic: str) -> str:
+    return topic.removesuffix("/compressed").rpartition("/")[0]
