@@ -18,7 +18,7 @@ the stars' annual aberration, which the light of an Earth satellite does not hav
 **Camera.**  1024x1024 px of 8", as a 135 mm lens has on pixels of 5.2 um; two frames a second, in
 bursts over the pass.  *Tracking*: exposures of 0.2 s; an alt-azimuth mount follows the prediction,
 0.2 s late and with a wander of 0.05 deg, so that stars streak and the field turns.  *Stares*:
-0.05 s; in each burst the camera stands still against the stars, and the satellite streaks by 4 px.
+0.1 s; in each burst the camera stands still against the stars, and the satellite streaks by 8 px.
 Images are stamped at the start of the exposure, and attitudes ten times a second by a clock of
 their own: the chain has to find the middle of the exposure and the attitude then.  In stares the
 time of the images counts (1 ms is 0.7" at 0.2 deg/s), in tracking that of the attitudes.

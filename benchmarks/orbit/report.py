@@ -141,7 +141,7 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--stare-exposure-s",
         type=float,
-        default=0.05,
+        default=0.1,
         help="exposure of the stares, in which the satellite streaks (default: %(default)s)",
     )
     parser.add_argument(
