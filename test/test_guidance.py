@@ -30,6 +30,7 @@ def track(track_id: int = 1, xy=(CENTRE, CENTRE), rel=(0.0, 0.0), v=None, **colu
     row["rel_vx"], row["rel_vy"] = rel
     row["vx"], row["vy"] = rel if v is None else v
     row["sigma_vx"] = row["sigma_vy"] = 0.5
+    row["sight"] = (0.0, 0.0, 1.0)
     for name, value in columns.items():
         row[name] = value
     return row
@@ -235,6 +236,17 @@ def test_rate_and_its_change_are_limited_with_the_direction_kept():
     np.testing.assert_allclose(fast[:, 0] / fast[:, 1], -200 / 300, rtol=0.02)
 
 
+def test_lowered_limit_of_the_rate_holds_at_once():
+    guide, command = following()
+    guide.parameters = guide.parameters.replace(max_rate_deg_s=0.05)
+    lowered = guide.command(ns(1.05)).mount_rate
+    assert np.degrees(np.linalg.norm(lowered)) == pytest.approx(0.05, rel=1e-9)
+    assert lowered @ command.mount_rate > 0
+    guide.engage(False)
+    guide.parameters = guide.parameters.replace(max_rate_deg_s=0.01)
+    assert np.degrees(np.linalg.norm(guide.command(ns(1.05)).mount_rate)) <= 0.01 + 1e-9
+
+
 def test_limited_rate_winds_nothing_up():
     # Six times faster than the mount may go, then still.
     azimuth = lambda t: 0.6 * min(t, 5.0)  # noqa: E731
@@ -310,6 +322,54 @@ def test_what_is_nan_does_not_keep_alive():
     assert is_still_after(found, 2.6)
     # It was followed for 1 s, and so waited for as long.
     assert "track 1 was lost 1.1 s ago" in guide.command(ns(4.05)).reason
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        {"rel_vx": 1e160},
+        {"rel_vy": -1e308, "rel_vx": 1e308},
+        {"rel_vx": np.inf},
+        {"rel_vx": 3e5},  # 14 rad/s
+        {"x": 1e300},
+        {"y": -600.0},
+        {"sight": np.nan},
+    ],
+)
+@pytest.mark.parametrize("on", [True, False])
+def test_what_cannot_be_is_no_target(columns, on):
+    guide = Guide(GuideParameters(engaged=on))
+    for tick in range(3):
+        guide.update(ns(tick / 10), rows(track(**{"v": (0, 0)} | columns)), CAMERA)
+        command = guide.command(ns(tick / 10))
+        assert command.target_id == 0
+        assert not command.mount_rate.any()
+
+
+def test_velocity_in_the_image_that_cannot_be_is_not_the_mounts():
+    guide = Guide()
+    guide.update(ns(0), rows(track(rel=(72, 0), v=(1e200, 1e308))), CAMERA)
+    guide.engage(True)
+    assert np.isfinite(guide.command(ns(0)).mount_rate).all()
+    command = guide.command(ns(0.1))
+    assert command.state == "following"
+    assert np.degrees(np.linalg.norm(command.mount_rate)) <= 0.1 + 1e-9
+
+
+def test_no_finite_input_makes_the_command_infinite():
+    rng = np.random.default_rng(7)
+    guide, t = engaged(reacquire_s=0.5), 0.0
+    numbers = ("x", "y", "vx", "vy", "rel_vx", "rel_vy")
+    for _ in range(600):
+        t += rng.choice([1e-9, 0.05, 0.1, 3.0, -0.2], p=[0.1, 0.4, 0.4, 0.05, 0.05])
+        wild = {name: rng.normal() * 10.0 ** rng.integers(-3, 7) for name in numbers}
+        number = int(rng.integers(1, 3))
+        status = int(rng.choice([SEEN, COASTING]))
+        guide.update(ns(t), rows(track(number, status=status, **wild)), CAMERA)
+        command = guide.command(ns(t + 0.05))
+        assert np.isfinite(command.mount_rate).all()
+        assert np.degrees(np.linalg.norm(command.mount_rate)) <= 3.0 + 1e-9
+    assert is_still_after(speeds(guide, t + 0.05, t + 9), t + 2 + 4)
 
 
 def test_coasting_is_followed_for_a_while_but_does_not_keep_alive():
@@ -441,6 +501,15 @@ def test_target_is_chosen(given, wanted):
         assert "track 8 is not there" in command.reason
 
 
+@pytest.mark.parametrize("given", [{}, {"target": "nearest"}, {"target": "id", "target_id": 4}])
+def test_what_is_only_expected_is_not_chosen(given):
+    guide = Guide(GuideParameters(**given))
+    guide.update(ns(0), rows(track(4, status=COASTING)), CAMERA)
+    assert guide.command(ns(0)).target_id == 0
+    guide.update(ns(0.1), rows(track(4)), CAMERA)
+    assert guide.command(ns(0.1)).target_id == 4
+
+
 def test_target_is_kept_though_another_becomes_better():
     guide = Guide(GuideParameters(target="brightest"))
     guide.update(ns(0), THREE, CAMERA)
@@ -551,3 +620,18 @@ def test_detector_that_began_anew_is_noticed():
     # Its numbers begin at 1 again: not the same object, though the same number.
     guide.update(ns(2.2), rows(track(1, (30, 400), (3, 3))), CAMERA)
     assert "lost" in guide.command(ns(2.2)).reason
+
+
+@pytest.mark.parametrize(("gap_s", "same"), [(1.5, True), (2.5, False)])
+def test_same_number_after_silence_is_not_the_same_object(gap_s, same):
+    # No cloud tells of the gap: after a long one the detector may have begun anew.
+    guide = lost(seconds=4.0)
+    elsewhere = rows(track(1, (CENTRE, CENTRE - 150), (3, 3)))
+    guide.update(ns(4 + gap_s), elsewhere, CAMERA)
+    assert ("lost" in guide.command(ns(4 + gap_s)).reason) != same
+
+
+def test_same_number_on_its_path_after_silence_is_followed_on():
+    guide = lost(seconds=4.0)
+    guide.update(ns(7), rows(track(1, (CENTRE + 350 + 9, CENTRE), (50, 0))), CAMERA)
+    assert "following: track 1, " in guide.command(ns(7)).reason

@@ -5,8 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from ofsat_ros.camera import Astrometry
 from ofsat_ros.guidance import Guide
-from ofsat_ros.parameters import GuideParameters
+from ofsat_ros.parameters import CameraParameters, GuideParameters
 from ofsat_ros.pipeline import Pipeline
 from ofsat_ros.simulation import scenario
 
@@ -27,6 +28,8 @@ def loop(name: str, **settings) -> Iterator[tuple]:
     sky = scenario(name, 1, width=256, height=256, star_count=120, **settings)
     s, mount, camera = sky.settings, sky.motion, sky.camera
     pipeline, guide = Pipeline(), Guide(GuideParameters(engaged=True))
+    astrometry = Astrometry(CameraParameters())
+    astrometry.camera = camera
     waiting: list[tuple] = []
     ticks = iter(np.arange(0, s.frames * s.period_s + 1, 1 / COMMANDS_HZ))
     tick = next(ticks)
@@ -42,6 +45,7 @@ def loop(name: str, **settings) -> Iterator[tuple]:
             tick = next(ticks)
         frame = sky.frame()
         result = pipeline.process(frame.image, frame.stamp_ns)
+        astrometry.locate(result.tracks, frame.stamp_ns)
         waiting.append((start + s.exposure_s + LATE_S, frame.stamp_ns, result.tracks))
         off = np.full(2, np.nan)
         if len(frame.truth):

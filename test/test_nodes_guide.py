@@ -12,6 +12,7 @@ from geometry_msgs.msg import TwistStamped, Vector3Stamped
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from ros_graph import Graph, Process
+from rosgraph_msgs.msg import Clock as ClockMessage
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, PointCloud2
 from std_msgs.msg import Header
@@ -37,6 +38,7 @@ def tracks(*given: dict) -> np.ndarray:
     """Tracks seen at the boresight, unless told otherwise; they go right at 72 px/s."""
     rows = np.zeros(len(given), TRACK_DTYPE)
     usual = {"track_id": 1, "status": 1, "x": 255.5, "y": 255.5, "rel_vx": 72.0, "flux": 100.0}
+    usual["sight"] = (0.0, 0.0, 1.0)
     for row, own in zip(rows, given, strict=True):
         for name, value in (usual | own).items():
             row[name] = value
@@ -196,6 +198,17 @@ def test_nan_tracks_are_not_followed(bench):
     assert not any(angular(message).any() for message in bench.mount)
 
 
+def test_tracks_without_lines_of_sight_are_not_followed(bench):
+    # As when camera_info is not for images of this size, which only the detector sees.
+    bench.engage(True)
+    bench.rows = tracks({"sight": math.nan})
+    bench.until(lambda: "the detector gives no lines of sight" in bench.message())
+    assert bench.last["state"] == "searching"
+    assert not any(angular(message).any() for message in bench.mount)
+    bench.rows = tracks({})
+    bench.until(lambda: bench.message().startswith("following: track 1"))
+
+
 def test_target_is_chosen_by_parameter_while_running(bench):
     bench.rows = tracks({}, {"track_id": 5, "x": 300.5}, {"track_id": 6, "flux": 900.0})
     bench.until_state("disengaged")
@@ -230,6 +243,44 @@ def test_clock_that_disagrees_with_the_stamps_is_named(bench):
     bench.until_state("dead-man")
     bench.until(lambda: "frames are stamped 40.0 s behind this node's clock" in bench.message())
     assert not any(angular(message).any() for message in bench.mount)
+
+
+def test_clock_that_is_set_back_silences_nothing():
+    with Bench("-p", "use_sim_time:=true") as bench:
+        clock = bench.graph.publisher(ClockMessage, "/clock", best_effort=True)
+        bench.graph.connect(clock)
+
+        def until(condition, at_s: float, speed: float = 1.0) -> None:
+            begun_s = time.monotonic()
+
+            def served() -> bool:
+                now_ns = round((at_s + speed * (time.monotonic() - begun_s)) * 1e9)
+                clock.publish(ClockMessage(clock=messages.time_message(now_ns)))
+                return condition()
+
+            bench.until(served)
+
+        bench.engage(True)
+        until(lambda: bench.mount and angular(bench.mount[-1]).any(), 5000)
+        # An hour would have to go by on the clock.
+        until(lambda: bench.mount[-1].header.stamp.sec < 2000, 1400)
+        until(lambda: bench.message().startswith("following"), 1500)
+        # Where it stands still, nothing is sent, and the mount stops of itself.
+        until(lambda: bench.mount[-1].header.stamp.sec == 1600, 1600, 0)
+        heard, end_s = len(bench.mount), time.monotonic() + 0.3
+        until(lambda: time.monotonic() > end_s, 1600, 0)
+        assert len(bench.mount) == heard
+
+
+def test_nothing_is_commanded_after_the_last_zero(bench):
+    bench.engage(True)
+    bench.until(lambda: bench.mount and angular(bench.mount[-1]).any())
+    bench.guide.close()
+    bench.until(lambda: not angular(bench.mount[-1]).any())
+    heard, end_s = len(bench.mount), time.monotonic() + 0.3
+    # What calls back once more, from another thread, says nothing.
+    bench.until(lambda: time.monotonic() > end_s)
+    assert len(bench.mount) == heard
 
 
 def test_another_that_commands_the_mount_is_named(bench):

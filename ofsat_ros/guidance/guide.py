@@ -142,7 +142,8 @@ class Guide:
             Middle of its exposure, ns UTC.  A frame that is older than the one before ends what
             was followed; one with the same stamp is left out.
         tracks : (N,) TRACK_DTYPE
-            What is NaN in position or velocity is taken as not there.
+            What is NaN in position, velocity or line of sight (`sight`) is taken as not there, as
+            is what cannot be.
         camera : Camera or None
             None: not calibrated; nothing is followed.
         """
@@ -180,9 +181,10 @@ class Guide:
             offset, rate = offset_of(sight), boresight_rate(omega) - self._own.rate(now_ns)
         if self.engaged and not self._commanding:
             # As the mount moves just now: it is taken over without a jerk.
-            seen = self._own.rate(now_ns) if fresh else np.zeros(2)
-            self._rate = shortened(seen, np.radians(self._parameters.max_rate_deg_s))
+            self._rate = self._own.rate(now_ns) if fresh else np.zeros(2)
             self._commanding = True
+        # A limit that was lowered holds at once, whatever the acceleration's.
+        self._rate = shortened(self._rate, np.radians(self._parameters.max_rate_deg_s))
         if self.engaged and fresh and self._target is not None:
             self._steer(self._target, now_ns, step_s)
         else:
@@ -238,7 +240,7 @@ class Guide:
         if target is None:
             self._choose(sights)
             return
-        row = same_again(target, sights, self._own, camera)
+        row = same_again(target, sights, self._own, camera, self._stale_s)
         if row is not None:
             if not target.present:
                 self._loop.start_anew()

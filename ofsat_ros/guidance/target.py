@@ -22,6 +22,8 @@ _NEAR_PX, _OF_ITS_WAY, _OF_OUR_WAY = 10.0, 0.2, 0.1
 _OF_ITS_RATE, _RATE_SIGMAS = 0.3, 4.0
 # Its acceleration is learned in such a time, and foretells no more than such a time, s.
 _LEARN_S, _FORETELL_S = 1.5, 3.0
+# Faster than this is no target and no mount, rad/s.
+_FASTEST = 10.0
 _NS = 1_000_000_000
 
 
@@ -50,15 +52,24 @@ class Sights:
 
     @classmethod
     def of(cls, stamp_ns: int, tracks: NDArray[np.void], camera: Camera) -> Sights:
-        """Turn tracks into directions."""
-        xy, own, image = (
-            np.column_stack([tracks[x], tracks[y]])
-            for x, y in (("x", "y"), ("rel_vx", "rel_vy"), ("vx", "vy"))
-        )
+        """Turn tracks into directions.
+
+        Left out is what has no line of sight already, since then the calibration is not one of
+        the images or has not come to the detector; what lies outside of the image by more than
+        its size; and what is not finite, or faster than 10 rad/s.
+        """
+        size = np.array([camera.width, camera.height])
+        within = np.abs(_pairs(tracks, "x", "y") - size / 2) <= 1.5 * size
+        tracks = tracks[within.all(axis=1) & np.isfinite(tracks["sight"]).all(axis=1)]
+        xy = _pairs(tracks, "x", "y")
         sight = camera.lines_of_sight(xy)
-        omega = np.cross(sight, camera.rates(xy, own))
-        seen = (omega - np.cross(sight, camera.rates(xy, image)))[:, [1, 0]] * (1, -1)
-        usable = np.isfinite(sight).all(axis=1) & np.isfinite(omega).all(axis=1)
+        # Whatever the numbers are, what comes of them is judged below.
+        with np.errstate(over="ignore", invalid="ignore"):
+            omega = np.cross(sight, camera.rates(xy, _pairs(tracks, "rel_vx", "rel_vy")))
+            in_image = np.cross(sight, camera.rates(xy, _pairs(tracks, "vx", "vy")))
+            seen = (omega - in_image)[:, [1, 0]] * (1, -1)
+        seen[~(np.abs(seen) <= _FASTEST)] = np.nan
+        usable = np.isfinite(sight).all(axis=1) & (np.abs(omega) <= _FASTEST).all(axis=1)
         return cls(stamp_ns, tracks[usable], sight[usable], omega[usable], seen[usable])
 
     def row(self, track_id: int) -> int | None:
@@ -157,32 +168,37 @@ def found_again(before: Target, sights: Sights, row: int, own: OwnMotion) -> Tar
 
 
 def choose(sights: Sights, parameters: GuideParameters) -> int | None:
-    """Return the row of the track that the parameters ask for; None if there is none."""
-    tracks = sights.tracks
+    """Return the row of the track that the parameters ask for; None if none is seen."""
+    # What is only expected tells nothing new, and may have been wrong for long.
+    (seen,) = np.nonzero(sights.tracks["status"] != COASTING)
+    tracks = sights.tracks[seen]
     if parameters.target == "id":
-        return sights.row(parameters.target_id)
+        seen = seen[tracks["track_id"] == parameters.target_id]
+        return int(seen[0]) if len(seen) else None
     if not len(tracks):
         return None
-    # What is only expected is the second choice.
-    unseen = (tracks["status"] == COASTING).astype(float)
     if parameters.target == "brightest":
         worse = -np.nan_to_num(tracks["flux"], nan=-np.inf)
     elif parameters.target == "nearest":
-        worse = -sights.sight[:, 2]
+        worse = -sights.sight[seen, 2]
     else:
         worse = tracks["track_id"].astype(float)
-    return int(np.lexsort([worse, unseen])[0])
+    return int(seen[np.argmin(worse)])
 
 
-def same_again(target: Target, sights: Sights, own: OwnMotion, camera: Camera) -> int | None:
+def same_again(
+    target: Target, sights: Sights, own: OwnMotion, camera: Camera, stale_after_s: float
+) -> int | None:
     """Return the row of a later frame that is the target; None if there is none.
 
     That is its own track's, seen or where it is expected; and if that has no such row, a new
-    track's on the same path.
+    track's on the same path.  After a gap of `stale_after_s`, of which no frame tells, the number
+    alone says nothing: the detector may have begun anew.
     """
     tracks = sights.tracks
     row = sights.row(target.track_id)
-    if row is not None and target.present and tracks["status"][row] != COASTING:
+    sure = target.present and sights.stamp_ns - target.stamp_ns < stale_after_s * _NS
+    if row is not None and sure and tracks["status"][row] != COASTING:
         return row
     distance = _distance(target, sights, own, camera)
     if row is not None and target.present and distance[row] <= 1:
@@ -214,8 +230,13 @@ def _distance(target: Target, sights: Sights, own: OwnMotion, camera: Camera) ->
     return distance
 
 
+def _pairs(tracks: NDArray[np.void], x: str, y: str) -> Array:
+    """Two columns of a table, (N, 2)."""
+    return np.column_stack([tracks[x], tracks[y]])
+
+
 def _pixel_angle(camera: Camera, tracks: NDArray[np.void]) -> Array:
     """Angle of a pixel at each track, rad."""
-    xy = np.column_stack([tracks["x"], tracks["y"]])
+    xy = _pairs(tracks, "x", "y")
     along_x = np.broadcast_to([1.0, 0.0], xy.shape)
     return np.linalg.norm(camera.rates(xy, along_x), axis=1)

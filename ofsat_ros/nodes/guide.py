@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import sys
+import threading
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
@@ -16,7 +17,6 @@ from geometry_msgs.msg import TwistStamped, Vector3Stamped
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, PointCloud2
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool
@@ -25,7 +25,7 @@ from ofsat_ros.camera import Astrometry, Camera, CameraError
 from ofsat_ros.guidance import Command, Guide
 from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.ros_parameters import NodeParameters
-from ofsat_ros.nodes.runtime import overridable_qos, parser_of, reliable, run
+from ofsat_ros.nodes.runtime import hear_camera_info, overridable_qos, parser_of, reliable, run
 from ofsat_ros.parameters import CameraParameters, GuideParameters, Table
 
 # A frame's tracks that come late are of use only if nothing newer has come.
@@ -65,20 +65,28 @@ class GuideNode(Node):
         self._lag_s = math.nan  # of the newest frame, when it came
         self._command: Command | None = None
         self._said = ""
+        self._without_sight = False
+        # Commands and close() come from two threads.
+        self._lock = threading.Lock()
+        self._closed = False
         self._create_publishers()
         self._subscribe()
         self.create_service(SetBool, "~/engage", self._on_engage)
-        # Of the node's own clock: where that stands still, nothing is sent, and the mount stops.
-        self.create_timer(1 / own.command_hz, self._on_command_due)
+        # A timer of the node's own clock would be silent for as long as that was set back.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(1 / own.command_hz, self._on_command_due, clock=steady)
         self.create_timer(1.0, self._publish_diagnostics, clock=steady)
         how = "engaged" if own.engaged else "disengaged; call ~/engage"
         self.get_logger().info(f"waiting for tracks on {self._tracks.topic_name}; {how}")
 
     def close(self) -> None:
-        """Tell the mount to stop, if it hears this node."""
-        if self._command is not None and self._command.commanding:
-            self._publish_rate(self._header(), np.zeros(3))
+        """Tell the mount to stop, if it hears this node; that is the last it hears."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            if self._command is not None and self._command.commanding:
+                self._publish_rate(self._header(), np.zeros(3))
 
     def _create_publishers(self) -> None:
         def publisher(kind: type, topic: str):
@@ -92,15 +100,7 @@ class GuideNode(Node):
         self._diagnostics = publisher(DiagnosticArray, "/diagnostics")
 
     def _subscribe(self) -> None:
-        # Camera drivers offer best effort or reliable; best effort hears both.
-        hears_all = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self.create_subscription(
-            CameraInfo,
-            "camera_info",
-            self._on_camera_info,
-            hears_all,
-            qos_overriding_options=overridable_qos(),
-        )
+        hear_camera_info(self, self._on_camera_info)
         self._tracks = self.create_subscription(
             PointCloud2,
             "rso_tracks",
@@ -141,6 +141,7 @@ class GuideNode(Node):
         self._lag_s = (self._now_ns() - middle_ns) / _NS
         self._frame_id = cloud.header.frame_id
         self._frames += 1
+        self._without_sight = len(tracks) > 0 and not np.isfinite(tracks["sight"]).any()
         self._guide.update(middle_ns, tracks, self._astrometry.camera)
 
     def _on_engage(self, request: SetBool.Request, response: SetBool.Response):
@@ -155,8 +156,14 @@ class GuideNode(Node):
         return response
 
     def _on_command_due(self) -> None:
+        with self._lock:
+            if not self._closed:
+                self._tell_mount()
+
+    def _tell_mount(self) -> None:
         now_ns = self._now_ns()
-        if not now_ns:  # no /clock yet
+        # No /clock yet, or it stands still: nothing is sent, and the mount stops.
+        if not now_ns or (self._command is not None and now_ns == self._command.stamp_ns):
             return
         self._command = command = self._guide.command(now_ns)
         header = self._header()
@@ -211,6 +218,11 @@ class GuideNode(Node):
             found.append(command.reason)
         if self._uncalibrated:
             found.append(f"no directions: {self._uncalibrated}")
+        elif self._without_sight:
+            found.append(
+                "the detector gives no lines of sight: does it hear the same camera_info, and is"
+                " that one of its images' size?"
+            )
         if not self.count_publishers(self._tracks.topic_name):
             found.append(f"nobody publishes {self._tracks.topic_name}: is the detector running?")
         if abs(self._lag_s) > own.stale_after_s:

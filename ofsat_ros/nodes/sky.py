@@ -10,15 +10,14 @@ import threading
 
 import numpy as np
 from geometry_msgs.msg import QuaternionStamped
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
 
 from ofsat_ros.camera import Astrometry, Camera, CameraError, rotation_of
 from ofsat_ros.nodes import messages
-from ofsat_ros.nodes.runtime import overridable_qos
+from ofsat_ros.nodes.runtime import hear_camera_info, overridable_qos
 from ofsat_ros.parameters import CameraParameters
 
 # Small messages, of which one thread may be late in taking many.
@@ -35,7 +34,7 @@ class Sky:
         Subscribes to ``camera_info`` and ``attitude``.
     parameters : CameraParameters
     reliable_input : bool
-        Ask for reliable delivery, as for the images; else best effort, which hears every sender.
+        Ask for attitudes as for the images: reliable; else best effort, which hears every sender.
     """
 
     def __init__(self, node: Node, parameters: CameraParameters, reliable_input: bool) -> None:
@@ -45,34 +44,14 @@ class Sky:
         self._info: CameraInfo | None = None
         self._uncalibrated = "no camera_info has come"
         self._has_attitude = False
+        hear_camera_info(node, self._on_camera_info)
         kind = ReliabilityPolicy.RELIABLE if reliable_input else ReliabilityPolicy.BEST_EFFORT
-        qos = QoSProfile(depth=_DEPTH, reliability=kind)
-        node.create_subscription(
-            CameraInfo,
-            "camera_info",
-            self._on_camera_info,
-            qos,
-            qos_overriding_options=overridable_qos(),
-        )
         node.create_subscription(
             QuaternionStamped,
             "attitude",
             self._on_attitude,
-            qos,
+            QoSProfile(depth=_DEPTH, reliability=kind),
             qos_overriding_options=overridable_qos(),
-        )
-        # Some senders say a calibration once, and keep it for those who come later.  Others are
-        # heard above: that they don't keep it is no fault.
-        node.create_subscription(
-            CameraInfo,
-            "camera_info",
-            self._on_camera_info,
-            QoSProfile(
-                depth=1,
-                reliability=ReliabilityPolicy.RELIABLE,
-                durability=DurabilityPolicy.TRANSIENT_LOCAL,
-            ),
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
         )
 
     def set_parameters(self, parameters: CameraParameters) -> None:
