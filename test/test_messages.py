@@ -264,11 +264,22 @@ def test_a_cloud_of_something_else_says_what_it_lacks():
     "change",
     [
         lambda cloud: setattr(cloud, "width", 3),
+        lambda cloud: (setattr(cloud, "width", 2**32 - 1), setattr(cloud, "height", 2**32 - 1)),
+        lambda cloud: (setattr(cloud, "width", 2**31), setattr(cloud, "height", 2**31)),
         lambda cloud: setattr(cloud, "point_step", 10),
+        lambda cloud: setattr(cloud, "point_step", 2**32 - 1),
         lambda cloud: setattr(cloud.fields[0], "datatype", 99),
         lambda cloud: setattr(cloud.fields[0], "name", cloud.fields[1].name),
     ],
-    ids=["too few points", "overlapping points", "no such type", "a name twice"],
+    ids=[
+        "too few points",
+        "more points than can be counted",
+        "more bytes than can be counted",
+        "overlapping points",
+        "points too long",
+        "no such type",
+        "a name twice",
+    ],
 )
 def test_a_cloud_that_contradicts_itself_is_refused(change):
     cloud = messages.detections_cloud(HEADER, detections(2))

@@ -5,6 +5,7 @@ import os
 import re
 import signal
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -20,7 +21,7 @@ from ofsat_ros.detection import CONFIRMED
 from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.runtime import StartError
 from ofsat_ros.nodes.tdm_writer import TdmWriter
-from ofsat_ros.parameters import ParameterError
+from ofsat_ros.parameters import ParameterError, TdmWriterParameters
 
 START_S = 1_790_000_000
 
@@ -165,6 +166,85 @@ def test_files_of_an_earlier_run_stay(writer, tmp_path):
     assert tracks_of(tmp_path / "out") == [old.name, "20260921T141320_1_2.tdm"]
 
 
+def test_a_name_that_another_writer_takes_meanwhile_is_not_used(writer, tmp_path, monkeypatch):
+    real, first = os.fsync, tmp_path / "out" / "20260921T141320_1.tdm"
+
+    def another_writes(number: int) -> None:
+        real(number)
+        first.write_text("another's")
+
+    monkeypatch.setattr("os.fsync", another_writes)
+    writer.hear(*(cloud(k, 1) for k in range(5)))
+    writer.node.close()
+    assert first.read_text() == "another's"
+    assert tracks_of(tmp_path / "out") == [first.name, "20260921T141320_1_2.tdm"]
+    assert writer.node.exit_code == 0
+
+
+@pytest.mark.parametrize(
+    "writer", [("longest_directions:=10", "object_names:=1=25544")], indirect=True
+)
+def test_a_long_track_makes_several_files(writer, tmp_path):
+    writer.hear(*(cloud(k, 1) for k in range(21)))
+    names = ["20260921T141320_1.tdm", "20260921T141330_1.tdm"]
+    assert tracks_of(tmp_path / "out") == names
+    writer.node.close()
+    paths = [tmp_path / "out" / name for name in (*names, "20260921T141340_1.tdm")]
+    assert tracks_of(tmp_path / "out") == [path.name for path in paths]
+    found = [at[17:19] for path in paths for at, _ in angles(path)]
+    assert found == [f"{(20 + k) % 60:02d}" for k in range(21)]
+    assert all("PARTICIPANT_2   = 25544\n" in path.read_text() for path in paths)
+
+
+class Steady:
+    """A clock that is set by hand."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+
+@pytest.mark.parametrize(("interval_s", "silent_s"), [(0.1, 10), (1, 10), (6, 30)])
+def test_tracks_end_when_no_more_images_come(writer, tmp_path, monkeypatch, interval_s, silent_s):
+    clock = Steady()
+    monkeypatch.setattr("ofsat_ros.nodes.tdm_writer.time", clock)
+    writer.node._on_timer()  # nothing was heard yet
+    for k in range(5):
+        writer.hear(cloud(k, 1, 2))
+        clock.now_s += interval_s
+    clock.now_s += silent_s - interval_s - 0.01
+    writer.node._on_timer()
+    assert tracks_of(tmp_path / "out") == []
+    clock.now_s += 0.02
+    writer.node._on_timer()
+    names = ["20260921T141320_1.tdm", "20260921T141320_2.tdm"]
+    assert tracks_of(tmp_path / "out") == names
+    writer.node._on_timer()
+    writer.hear(*(cloud(k, 1) for k in range(6, 9)))
+    writer.node.close()
+    assert tracks_of(tmp_path / "out") == [*names, "20260921T141326_1-2.tdm"]
+
+
+@pytest.mark.parametrize("name", ["kvn", "xml"])
+def test_what_is_open_after_a_night_is_written_at_once(tmp_path, name):
+    # Half a second is what a node has to close; the worst is when every file is full.
+    with Graph("-p", f"output:={tmp_path / 'out'}", "-p", f"format:={name}") as graph:
+        node = graph.add(TdmWriter(threading.Event(), context=graph.context))
+        longest = TdmWriterParameters().longest_directions
+        rows = messages.detections_array(cloud(0, 1, 2, 3, 4, 5))
+        rows["sigma_ra"] = rows["sigma_dec"] = 1e-6
+        for k in range(2 * longest):
+            node._arcs.add(START_S * 10**9 + k * 10**9, rows)
+        assert len(node._arcs.take_ended(1e9)) == 5
+        began = time.thread_time()
+        node.close()
+        # Only this thread's own work: others may keep the disk and the processor busy.
+        assert time.thread_time() - began < 0.5
+    assert len(tracks_of(tmp_path / "out")) == 5
+
+
 def test_without_directions_it_says_why_nothing_is_written(writer, tmp_path, capfd):
     heard = writer.graph.listen(DiagnosticArray, "/diagnostics")
     writer.hear(*(cloud(k, 1, 0, located=False) for k in range(5)))
@@ -196,7 +276,7 @@ def test_what_cannot_be_written_is_kept_and_tried_again(writer, tmp_path, monkey
     writer.hear(cloud(40), cloud(41))
     assert capfd.readouterr().err.count("No space left") == 1
     monkeypatch.setattr("os.fsync", real)
-    writer.node._try_again()
+    writer.node._on_timer()
     assert len(tracks_of(tmp_path / "out")) == 3
     writer.node.close()
     assert writer.node.exit_code == 0

@@ -287,6 +287,25 @@ class TestIod:
         path = written(tmp_path, "iod", station="0001", time_sigma_s=sigma)
         assert path.read_text()[41:43] == code
 
+    @pytest.mark.parametrize(
+        ("mag", "columns"),
+        [
+            (-99.94, "-999 01"),
+            (-99.96, ""),
+            (99.94, "+999 01"),
+            (99.96, ""),
+            (110.0, ""),
+            (-0.01, "+000 01"),
+        ],
+    )
+    def test_a_magnitude_that_has_no_room_is_left_out(self, tmp_path, mag, columns):
+        arcs = TrackArcs(
+            TrackingDataParameters(station="0001", zero_point_mag=10.0, least_detections=1)
+        )
+        arcs.add(START_NS, rows((3, 10, 10, np.nan, np.nan, 10 ** ((10 - mag) / 2.5), 25.0)))
+        arcs.write(tmp_path / "a.iod", "iod")
+        assert (tmp_path / "a.iod").read_text().splitlines()[0][66:] == columns
+
     def test_the_station_must_be_a_number(self, tmp_path):
         with pytest.raises(ParameterError, match=r"station must be four digits.*'OFSAT'"):
             TrackArcs(TrackingDataParameters(), ["kvn", "iod"])
@@ -325,6 +344,31 @@ class TestArcs:
         arcs.add(START_NS + 30 * 10**9, rows())
         assert self.labels(arcs.take_ended(5.5)) == {"2": 9}
         assert self.labels(arcs.take_all()) == {}
+
+    def test_an_arc_that_is_long_enough_is_cut(self):
+        # Least 3, at most 5: the 2 that are left are not a track of 2.
+        arcs = TrackArcs(TrackingDataParameters(least_detections=3), longest=5)
+        ended = []
+        for k in range(12):
+            arcs.add(START_NS + k * 10**9, rows((1, 10 + k / 100, 0), (2, 50, 0))[: 1 + (k == 6)])
+            ended += [(k, arc) for arc in arcs.take_ended(1000)]
+        assert [(k, arc.label, len(arc.rows)) for k, arc in ended] == [(5, "1", 5), (10, "1", 5)]
+        (last,) = arcs.take_all()
+        assert (last.label, len(last.rows)) == ("1", 2)
+        found = np.concatenate([arc.rows["stamp_ns"] for arc in (*dict(ended).values(), last)])
+        assert found.tolist() == [START_NS + k * 10**9 for k in range(12)]
+
+    def test_an_arc_is_not_cut_below_what_a_track_must_have(self):
+        arcs = TrackArcs(TrackingDataParameters(least_detections=8), longest=5)
+        for k in range(12):
+            arcs.add(START_NS + k * 10**9, rows((1, 10 + k / 100, 0)))
+        assert [len(arc.rows) for arc in arcs.take_all()] == [8, 4]
+
+    def test_a_jump_off_the_path_of_a_full_arc_is_another_object(self):
+        arcs = TrackArcs(TrackingDataParameters(least_detections=1), longest=5)
+        for k in range(6):
+            arcs.add(START_NS + k * 10**9, rows((1, 10 + k / 100 + 5 * (k == 5), 0)))
+        assert self.labels(arcs.take_all()) == {"1": 5, "1-2": 1}
 
     def test_a_number_that_comes_back_is_another_object(self):
         arcs = self.fed((0, [(1, 10, 0)]), (1, [(1, 10.1, 0)]), (20, []))
@@ -375,6 +419,36 @@ class TestFiles:
             collected().write(path, "kvn")
         assert path.read_text() == "precious"
         assert collected().write(path, "kvn", force=True) == 2
+        assert path.read_text().startswith("CCSDS_TDM_VERS")
+        assert list(tmp_path.iterdir()) == [path]
+
+    @pytest.mark.parametrize("links", [True, False])
+    def test_nothing_is_replaced_that_comes_in_between(self, tmp_path, monkeypatch, links):
+        path = tmp_path / "a.tdm"
+        real = files.os.fsync
+
+        def another_writes(number: int) -> None:
+            real(number)
+            path.write_text("precious")
+
+        def no_links(*_: object) -> None:
+            raise OSError(1, "Operation not permitted")
+
+        monkeypatch.setattr(files.os, "fsync", another_writes)
+        if not links:
+            monkeypatch.setattr(files.os, "link", no_links)
+        with pytest.raises(FileExistsError, match=r"a\.tdm exists already and is not replaced"):
+            collected().write(path, "kvn")
+        assert path.read_text() == "precious"
+        assert list(tmp_path.iterdir()) == [path]
+
+    def test_a_file_system_without_links_does(self, tmp_path, monkeypatch):
+        def no_links(*_: object) -> None:
+            raise OSError(1, "Operation not permitted")
+
+        monkeypatch.setattr(files.os, "link", no_links)
+        path = tmp_path / "a.tdm"
+        assert collected().write(path, "kvn") == 2
         assert path.read_text().startswith("CCSDS_TDM_VERS")
         assert list(tmp_path.iterdir()) == [path]
 

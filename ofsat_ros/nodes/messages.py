@@ -240,7 +240,7 @@ def cloud_array(cloud: PointCloud2) -> np.ndarray:
             }
         )
         return np.frombuffer(cloud.data, dtype, cloud.width * cloud.height)
-    except (KeyError, ValueError) as error:
+    except (KeyError, ValueError, OverflowError) as error:
         raise MessageError(f"the cloud contradicts itself: {error}") from error
 
 

@@ -9,9 +9,11 @@ would be off, and believe itself better than it is.
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import threading
+import time
 from collections import Counter
 from datetime import UTC, datetime
 from pathlib import Path
@@ -39,6 +41,9 @@ from ofsat_ros.tracking_data import SUFFIXES, Arc, TrackArcs, write_arcs
 _DEPTH = 1000  # detections of so many frames may wait while a file is written
 _WARN_EVERY_S = 10.0
 _RETRY_S = 10.0
+# No more images come when nothing was heard for so many times what lay between the last two
+# messages, but not before _RETRY_S: neither slow cameras nor slow players shall end the tracks.
+_SILENT_INTERVALS = 5
 _NO_DIRECTIONS = (
     "the detections have no right ascension and declination, so that there is nothing to write:"
     " the detector needs a calibration on camera_info and a fresh attitude, and its own"
@@ -82,7 +87,10 @@ class TdmWriter(Node):
         own = self._settings[TdmWriterParameters]
         self._format, self._ended_after_s = own.format, own.ended_after_s
         self._astrometry = Astrometry(self._settings[CameraParameters])
-        self._arcs = TrackArcs(self._settings[TrackingDataParameters], [own.format])
+        self._arcs = TrackArcs(
+            self._settings[TrackingDataParameters], [own.format], own.longest_directions
+        )
+        self._heard_s, self._interval_s = -math.inf, math.inf  # last message, and from its last
         self._folder = Path(own.output or datetime.now(UTC).strftime("tracks_%Y%m%d_%H%M%S"))
         _claim(self._folder)
         self._waiting: list[Arc] = []  # ended, and not yet written
@@ -101,7 +109,7 @@ class TdmWriter(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0, self._publish_diagnostics, clock=steady)
-        self.create_timer(_RETRY_S, self._try_again, clock=steady)
+        self.create_timer(_RETRY_S, self._on_timer, clock=steady)
         self.get_logger().info(
             f"writing the tracks of {subscription.topic_name} into {self._folder}"
         )
@@ -131,6 +139,7 @@ class TdmWriter(Node):
                 self._arcs.parameters = table
             elif isinstance(table, TdmWriterParameters):
                 self._ended_after_s = table.ended_after_s
+                self._arcs.longest = table.longest_directions
 
     def _on_detections(self, cloud: PointCloud2) -> None:
         try:
@@ -151,6 +160,8 @@ class TdmWriter(Node):
             self._waiting += ended
             if ended:
                 self._write_waiting()
+            now_s = time.monotonic()
+            self._interval_s, self._heard_s = now_s - self._heard_s, now_s
 
     def _count(self, rows: np.ndarray) -> None:
         of_tracks = rows[rows["track_id"] > 0]
@@ -163,10 +174,15 @@ class TdmWriter(Node):
     def _only_without_direction(self) -> bool:
         return 0 < self._counts["detections"] == self._counts["without_direction"]
 
-    def _try_again(self) -> None:
+    def _on_timer(self) -> None:
+        """End the tracks if no more images come, whose stamps would do so; write what waits."""
         with self._lock:
-            if not self._closed:
-                self._write_waiting()
+            if self._closed:
+                return
+            longest_s = max(self._ended_after_s, _RETRY_S, _SILENT_INTERVALS * self._interval_s)
+            if time.monotonic() - self._heard_s > longest_s:
+                self._waiting += self._arcs.take_all()
+            self._write_waiting()
 
     def _write_waiting(self) -> None:
         """Write what has ended; keep what cannot be written, and say why, once."""
@@ -175,6 +191,8 @@ class TdmWriter(Node):
             path = _free(self._folder, arc, SUFFIXES[self._format])
             try:
                 write_arcs(path, [arc], self._format, self._arcs.parameters)
+            except FileExistsError:  # another writer has just taken the name
+                continue
             except (OSError, ParameterError) as error:
                 why = f"{path} cannot be written: {getattr(error, 'strerror', None) or error}"
                 if not self._why_waiting:
@@ -228,7 +246,7 @@ def _free(folder: Path, arc: Arc, suffix: str) -> Path:
     first = datetime.fromtimestamp(arc.first_ns // 1_000_000_000, UTC)
     stem = f"{first:%Y%m%dT%H%M%S}_{arc.label}"
     path, number = folder / (stem + suffix), 1
-    while path.exists():
+    while os.path.lexists(path):
         number += 1
         path = folder / f"{stem}_{number}{suffix}"
     return path

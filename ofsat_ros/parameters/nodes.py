@@ -316,6 +316,15 @@ class TdmWriterParameters(Table):
         "a track that is not heard of for so long, in the time of the stamps, has ended, and is"
         " written",
     )
+    longest_directions: int = number(
+        500,
+        10,
+        100000,
+        "frames",
+        "tdm_writer",
+        "so many directions of a track make a file, and those that follow the next: the node ends"
+        " as soon as the open ones are written",
+    )
 
 
 def _check_text(name: str, text: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,10 +43,13 @@ class Arc:
         has been another object's before, which one it is: ``3``, then ``3-2``.
     rows : (N,) ARC_DTYPE
         Its directions; stamps ascend.
+    continues : bool
+        Whether it goes on where an arc of the same label ended, being as long as was allowed.
     """
 
     label: str
     rows: NDArray[np.void]
+    continues: bool = False
 
     @property
     def first_ns(self) -> int:
@@ -66,8 +70,11 @@ class ArcCollector:
         self._counts: Counter[int] = Counter()  # arcs so far of each number
         self._newest_ns: int | None = None
 
-    def add(self, stamp_ns: int, rows: NDArray[np.void]) -> None:
-        """Take a frame's detections, also if there are none: its stamp tells the time."""
+    def add(self, stamp_ns: int, rows: NDArray[np.void], longest: int | None = None) -> None:
+        """Take a frame's detections, also if there are none: its stamp tells the time.
+
+        An arc that has `longest` directions ends, and the track goes on in another.
+        """
         if self._newest_ns is not None and stamp_ns < self._newest_ns:
             self._end(list(self._open))
         self._newest_ns = stamp_ns
@@ -80,6 +87,9 @@ class ArcCollector:
             if arc is None or not arc.is_continued_by(row):
                 self._end([track_id])
                 arc = self._begin(track_id)
+            elif longest is not None and len(arc.rows) >= longest:
+                self._end([track_id])
+                arc = self._open[track_id] = _OpenArc(arc.label, continues=True)
             arc.rows.append(row)
 
     def all(self) -> list[Arc]:
@@ -113,8 +123,8 @@ class ArcCollector:
 class _OpenArc:
     """An arc that may go on."""
 
-    def __init__(self, label: str) -> None:
-        self.label = label
+    def __init__(self, label: str, continues: bool = False) -> None:
+        self.label, self.continues = label, continues
         self.rows: list[np.void] = []
 
     @property
@@ -140,7 +150,7 @@ class _OpenArc:
 
     def _row_before(self) -> np.void:
         """The row from which the last one's rate is taken."""
-        for row in self.rows[-2::-1]:
+        for row in islice(reversed(self.rows), 1, None):
             if self.last_ns - row["stamp_ns"] >= _RATE_S * _NS:
                 return row
         return self.rows[0]
@@ -159,7 +169,7 @@ def _arc_rows(stamp_ns: int, rows: NDArray[np.void]) -> NDArray[np.void]:
 
 
 def _closed(arcs: list[_OpenArc]) -> list[Arc]:
-    made = [Arc(arc.label, np.array(arc.rows, ARC_DTYPE)) for arc in arcs]
+    made = [Arc(arc.label, np.array(arc.rows, ARC_DTYPE), arc.continues) for arc in arcs]
     return sorted(made, key=lambda arc: arc.first_ns)
 
 

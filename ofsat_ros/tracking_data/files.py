@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -28,11 +29,17 @@ class TrackArcs:
     parameters : TrackingDataParameters
     formats : iterable of {"kvn", "xml", "iod"}
         What will be written: what these ask of the parameters is checked at once.
+    longest : int, optional
+        See below.
 
     Attributes
     ----------
     parameters : TrackingDataParameters
         May be replaced; what is written next obeys the new ones.
+    longest : int or None
+        An arc of so many directions (of ``least_detections``, if these are more) ends, and its
+        track goes on in another of the same label, of whatever length; None: no arc is cut.  May
+        be replaced.
 
     Raises
     ------
@@ -40,10 +47,15 @@ class TrackArcs:
         If a format cannot be written with the parameters.
     """
 
-    def __init__(self, parameters: TrackingDataParameters, formats: Iterable[str] = ()) -> None:
+    def __init__(
+        self,
+        parameters: TrackingDataParameters,
+        formats: Iterable[str] = (),
+        longest: int | None = None,
+    ) -> None:
         if "iod" in formats:
             check_iod(parameters)
-        self.parameters = parameters
+        self.parameters, self.longest = parameters, longest
         self._collector = ArcCollector()
 
     def add(self, stamp_ns: int, rows: NDArray[np.void]) -> None:
@@ -58,7 +70,8 @@ class TrackArcs:
             ``sigma_dec`` (rad), ``flux`` (DN), ``snr``, as DETECTION_DTYPE has them.  Those
             without number or direction are left out.
         """
-        self._collector.add(stamp_ns, rows)
+        longest = self.longest and max(self.longest, self.parameters.least_detections)
+        self._collector.add(stamp_ns, rows, longest)
 
     @property
     def arcs(self) -> list[Arc]:
@@ -72,7 +85,8 @@ class TrackArcs:
         ----------
         after_s : float
             An arc has ended if its last direction is so much older than the newest frame, or if
-            a frame with an earlier stamp has come, or its number has become another object's.
+            a frame with an earlier stamp has come, its number has become another object's, or it
+            was cut.
         """
         return self._long_enough(self._collector.take_ended(after_s))
 
@@ -94,7 +108,8 @@ class TrackArcs:
         return len(arcs)
 
     def _long_enough(self, arcs: list[Arc]) -> list[Arc]:
-        return [arc for arc in arcs if len(arc.rows) >= self.parameters.least_detections]
+        least = self.parameters.least_detections
+        return [arc for arc in arcs if arc.continues or len(arc.rows) >= least]
 
 
 def write_arcs(
@@ -137,15 +152,36 @@ def write_arcs(
 
 def _write_whole(path: Path, text: str, force: bool) -> None:
     """Write beside the place and move into it: a reader never sees a part."""
-    if not force and path.exists():
-        raise FileExistsError(f"{path} exists already and is not replaced")
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    if not force:
+        _check_free(path)
+    # Process numbers do not tell apart who writes from two machines or containers.
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
         with part.open("w", encoding="ascii", newline="\n") as file:
             file.write(text)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(part, path)
+        if force:
+            os.replace(part, path)
+        else:
+            _move_to_free(part, path)
     except BaseException:
         part.unlink(missing_ok=True)
         raise
+
+
+def _move_to_free(part: Path, path: Path) -> None:
+    """Move, but never onto a file, be it one that another process writes at this moment."""
+    try:
+        os.link(part, path)
+    except OSError:
+        _check_free(path)
+        # Not every file system has links; on those a file may come in between.
+        os.replace(part, path)
+    else:
+        part.unlink()
+
+
+def _check_free(path: Path) -> None:
+    if os.path.lexists(path):
+        raise FileExistsError(f"{path} exists already and is not replaced")

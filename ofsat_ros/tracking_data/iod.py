@@ -30,6 +30,7 @@ _NAME = re.compile(r"(?P<number>\d{1,5})?\s*((19|20)(?P<year>\d\d)-(?P<launch>\d
 # Of objects that have no number; the launches of a year are far fewer than 500.
 _UNKNOWN_NUMBER, _UNKNOWN_LAUNCH, _UNKNOWN_PIECE = 90_000, 500, "UNK"
 _MAG_PER_NOISE = 2.5 / math.log(10)
+_WIDEST_MAG = 999  # tenths, as three digits hold them
 
 
 def check_iod(parameters: TrackingDataParameters) -> None:
@@ -106,8 +107,8 @@ def _position_sigma(row: np.void) -> str:
 
 
 def _brightness(mag: float, row: np.void) -> str:
-    """Columns 67 to 73: magnitude and its std, tenths without a point."""
-    if not math.isfinite(mag):
+    """Columns 67 to 73: magnitude and its std, tenths without a point; none if they cannot."""
+    if not math.isfinite(mag) or abs(round(10 * mag)) > _WIDEST_MAG:
         return ""
     sigma = _MAG_PER_NOISE / row["snr"] if row["snr"] > 0 else math.nan
     tenths = f"{min(99, math.ceil(10 * sigma)):02d}" if math.isfinite(sigma) else ""

@@ -111,23 +111,23 @@ def magnitudes(rows: NDArray[np.void], zero_point_mag: float) -> NDArray[np.floa
 
 def _header(parameters: TrackingDataParameters, created_ns: int) -> tuple[list[str], _Pairs]:
     return [f"Written by ofsat_ros {__version__}"], [
-        ("CREATION_DATE", _time(created_ns)),
+        ("CREATION_DATE", utc(created_ns).strftime("%Y-%m-%dT%H:%M:%S.%f")),
         ("ORIGINATOR", _words(parameters.originator)),
     ]
 
 
 def _segment(arc: Arc, parameters: TrackingDataParameters) -> _Segment:
     rows = arc.rows
-    first, last = _time(arc.first_ns), _time(int(rows["stamp_ns"][-1]))
+    epochs = _times(rows["stamp_ns"])
     magnitude = magnitudes(rows, parameters.zero_point_mag)
-    observations = list(_observations(rows, magnitude))
+    observations = list(_observations(rows, epochs, magnitude))
     types = dict.fromkeys(key for key, _, _ in observations)
     metadata = [
         ("TRACK_ID", f"{utc(arc.first_ns):%Y%m%d_%H%M%S%f}-{arc.label}"),
         ("DATA_TYPES", ",".join(types)),
         ("TIME_SYSTEM", "UTC"),
-        ("START_TIME", first),
-        ("STOP_TIME", last),
+        ("START_TIME", epochs[0]),
+        ("STOP_TIME", epochs[-1]),
         ("PARTICIPANT_1", _words(parameters.station)),
         (
             "PARTICIPANT_2",
@@ -140,18 +140,19 @@ def _segment(arc: Arc, parameters: TrackingDataParameters) -> _Segment:
         ("REFERENCE_FRAME", "ICRF"),
         ("DATA_QUALITY", "RAW"),
     ]
-    return _Segment(_comments(rows, parameters), metadata, _sigmas(rows), observations)
+    return _Segment(_comments(rows, parameters), metadata, _sigmas(rows, epochs), observations)
 
 
 def _observations(
-    rows: NDArray[np.void], magnitude: NDArray[np.float64]
+    rows: NDArray[np.void], epochs: list[str], magnitude: NDArray[np.float64]
 ) -> Iterator[tuple[str, str, str]]:
-    for row, mag in zip(rows, magnitude.tolist(), strict=True):
-        epoch = _time(int(row["stamp_ns"]))
+    ras, decs = np.degrees(rows["ra"]) % 360, np.degrees(rows["dec"])
+    for epoch, ra, dec, mag in zip(
+        epochs, ras.tolist(), decs.tolist(), magnitude.tolist(), strict=True
+    ):
         # Rounding may lead to 360, which the standard excludes.
-        ra = round(math.degrees(row["ra"]) % 360, _ANGLE_DIGITS) % 360
-        yield "ANGLE_1", epoch, _number(ra, _ANGLE_DIGITS)
-        yield "ANGLE_2", epoch, _number(math.degrees(row["dec"]), _ANGLE_DIGITS)
+        yield "ANGLE_1", epoch, _number(round(ra, _ANGLE_DIGITS) % 360, _ANGLE_DIGITS)
+        yield "ANGLE_2", epoch, _number(dec, _ANGLE_DIGITS)
         if math.isfinite(mag):
             yield "MAG", epoch, _number(mag, _MAG_DIGITS)
 
@@ -167,25 +168,26 @@ def _comments(rows: NDArray[np.void], parameters: TrackingDataParameters) -> lis
     return lines
 
 
-def _sigmas(rows: NDArray[np.void]) -> list[str]:
+def _sigmas(rows: NDArray[np.void], epochs: list[str]) -> list[str]:
     """Comments with the std of every direction that has one, and with the rms of them all."""
-    known = rows[np.isfinite(rows["sigma_ra"]) & np.isfinite(rows["sigma_dec"])]
-    if not len(known):
+    sigmas = np.column_stack([rows["sigma_ra"], rows["sigma_dec"]])
+    known = np.isfinite(sigmas).all(axis=1)
+    if not known.any():
         return ["SIGMA unknown"]
-    rms = [math.sqrt(np.mean(np.square(known[name]))) for name in ("sigma_ra", "sigma_dec")]
+    rms = np.sqrt(np.mean(np.square(sigmas[known]), axis=0))
     return [
         "SIGMA epoch, std of ANGLE_1 times cos ANGLE_2 and of ANGLE_2, arcsec",
         f"SIGMA rms {_arcsec(rms[0])} {_arcsec(rms[1])}",
         *(
-            f"SIGMA {_time(int(row['stamp_ns']))} {_arcsec(row['sigma_ra'])}"
-            f" {_arcsec(row['sigma_dec'])}"
-            for row in known
+            f"SIGMA {epochs[row]} {_arcsec(ra)} {_arcsec(dec)}"
+            for row, (ra, dec) in zip(np.flatnonzero(known), sigmas[known].tolist(), strict=True)
         ),
     ]
 
 
-def _time(stamp_ns: int) -> str:
-    return f"{utc(stamp_ns):%Y-%m-%dT%H:%M:%S.%f}"
+def _times(stamps_ns: NDArray[np.int64]) -> list[str]:
+    """The same as `utc`, of many times at once, as the standard writes them."""
+    return list(np.datetime_as_string(((stamps_ns + 500) // 1000).astype("M8[us]")).tolist())
 
 
 def _arcsec(angle: float) -> str:
