@@ -25,7 +25,7 @@ def loop(name: str, **settings) -> Iterator[tuple]:
     That is: time; true offset of the RSO, px, NaN outside of the image; track that is followed;
     the guide's state; commanded rate, deg/s.
     """
-    sky = scenario(name, 1, width=256, height=256, star_count=120, **settings)
+    sky = scenario(name, 1, width=256, height=256, **settings)
     s, mount, camera = sky.settings, sky.motion, sky.camera
     pipeline, guide = Pipeline(), Guide(GuideParameters(engaged=True))
     astrometry = Astrometry(CameraParameters())
