@@ -139,7 +139,7 @@ class Processing:
         # Most cameras are not calibrated, and nobody misses directions then.
         wanted = self._arcs is not None or self._calibrated
         for why, count in totals.unlocated.items() if wanted else ():
-            self._say(f"note: {count} detections have no ra and dec: {why}")
+            self._say(f"note: {count} detections have no ra and dec: {why}{_missing(frames)}")
 
     def _take(self, frame: Frame) -> None:
         totals = self.totals
@@ -208,3 +208,13 @@ class Processing:
         if self._arcs is not None:
             self._arcs.add(stamp_ns, detections)
         self.totals.detections.update(detections["track_id"].tolist())
+
+
+def _missing(frames: Recording) -> str:
+    """Say which topics for directions a recording does not have; empty if it has both."""
+    topics = {
+        "camera_info (sensor_msgs/CameraInfo)": frames.camera_info_topic,
+        "attitude (geometry_msgs/QuaternionStamped)": frames.attitude_topic,
+    }
+    missing = [about for about, topic in topics.items() if not topic]
+    return f"; the recording has no topic {' and none '.join(missing)}" if missing else ""

@@ -1,5 +1,7 @@
 """The detector's directions: calibration and attitude in over DDS, x y z, ra and dec out."""
 
+import itertools
+
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -218,3 +220,20 @@ def test_an_attitude_that_is_no_rotation_is_left_out(camera):
     camera.point(FIRST_NS, length=0.5)
     rows = run(camera)[-1]
     assert np.isfinite(rows["ra"]).all()
+
+
+def test_a_calibration_that_is_elsewhere_is_pointed_at(camera):
+    camera.graph.publisher(CameraInfo, "/camera/camera_info")
+    camera.graph.probe.destroy_publisher(camera.info)
+
+    def told() -> list[str]:
+        statuses = [status for array in camera.states for status in array.status]
+        return [_values(status).get("directions", "") for status in statuses]
+
+    stamps_ns = itertools.count(FIRST_NS, PERIOD_NS)
+
+    def is_told() -> bool:
+        camera.expose(next(stamps_ns), 0)
+        return any("/camera/camera_info" in words for words in told())
+
+    camera.graph.until(is_told)

@@ -115,7 +115,11 @@ def test_stamps_are_turned_into_the_middle_of_the_exposure(bag, reference, shift
     [
         ({"calibrated": False, "attitudes": False}, ""),
         ({"calibrated": False}, ""),
-        ({"attitudes": False}, "detections have no ra and dec: no attitude has come"),
+        (
+            {"attitudes": False},
+            "detections have no ra and dec: no attitude has come; the recording has no topic"
+            " attitude (geometry_msgs/QuaternionStamped)",
+        ),
         ({"size": (100, 80)}, "camera_info is for images of 100x80, not of 200x160"),
     ],
     ids=["nothing", "no calibration", "no attitude", "another size"],

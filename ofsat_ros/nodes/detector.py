@@ -265,6 +265,7 @@ class Detector(Node):
     def _look_around(self) -> None:
         self._image_publishers = self.count_publishers(self._images.topic_name)
         self._elsewhere = [] if self._image_publishers else self._other_image_topics()
+        self._sky.look_around()
         self._say_aloud()
 
     def _publish_diagnostics(self) -> None:

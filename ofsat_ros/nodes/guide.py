@@ -229,8 +229,9 @@ class GuideNode(Node):
             where = "behind" if self._lag_s > 0 else "ahead of"
             found.append(
                 f"frames are stamped {abs(self._lag_s):.1f} s {where} this node's clock: check"
-                " use_sim_time, stamp_offset_s and the machines' clocks"
+                " use_sim_time, stamp_offset_s, the machines' clocks, and that the sender keeps up"
             )
+            self.get_logger().warning(found[-1], throttle_duration_sec=_WARN_EVERY_S)
         others = self.count_publishers(self._mount_rate.topic_name) - 1
         if others > 0 and command is not None and command.commanding:
             found.append(f"{others} more publish {self._mount_rate.topic_name}")

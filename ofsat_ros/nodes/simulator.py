@@ -38,6 +38,7 @@ from ofsat_ros.simulation import SimulatedFrame, SimulatedMount, SphereSimulator
 
 _FRAME_ID = "camera_optical_frame"
 _DEPTH = 10
+_WARN_EVERY_S = 10.0
 # A machine that cannot keep up renders late, not in bursts: by so much it may fall behind.
 _MOST_BEHIND_S = 0.2
 
@@ -76,6 +77,7 @@ class Simulator(Node):
         self._attitude = self._publisher(QuaternionStamped, "attitude")
         self._truth = self._publisher(PointCloud2, "rso_truth")
         self._begun_s = time.monotonic()
+        self._behind_s = 0.0
         self._mount: SimulatedMount | None = None
         if isinstance(self._sky, SphereSimulator) and isinstance(self._sky.motion, SimulatedMount):
             self._mount = self._sky.motion
@@ -126,7 +128,15 @@ class Simulator(Node):
             while number < settings.frames or own.loop:
                 due_s = number * settings.period_s + settings.exposure_s
                 late_s = (self._now_s() - due_s) / own.rate
-                self._begun_s += max(0.0, late_s - _MOST_BEHIND_S)
+                if late_s > _MOST_BEHIND_S:
+                    self._begun_s += late_s - _MOST_BEHIND_S
+                    self._behind_s += late_s - _MOST_BEHIND_S
+                    self.get_logger().warning(
+                        "this machine renders slower than the camera exposes: stamps are"
+                        f" {self._behind_s:.1f} s behind the clock; lower the rate, or use fewer"
+                        " or smaller frames",
+                        throttle_duration_sec=_WARN_EVERY_S,
+                    )
                 self._stop.wait(max(0.0, -late_s))
                 if self._stop.is_set():
                     return

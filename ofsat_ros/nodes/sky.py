@@ -54,6 +54,24 @@ class Sky:
             qos_overriding_options=overridable_qos(),
         )
 
+    def look_around(self) -> None:
+        """Say once where calibrations are, if nobody sends one where this node listens."""
+        topic = self._node.resolve_topic_name("camera_info")
+        if self._info is not None or self._node.count_publishers(topic):
+            return
+        found = [
+            name
+            for name, kinds in self._node.get_topic_names_and_types()
+            if "sensor_msgs/msg/CameraInfo" in kinds and self._node.count_publishers(name)
+        ]
+        if not found:
+            return
+        why = f"nobody sends {topic}; remap camera_info (and attitude) to {' or '.join(found)}"
+        with self._lock:
+            said, self._uncalibrated = self._uncalibrated, why
+        if said != why:
+            self._node.get_logger().info(f"directions are unknown: {why}")
+
     def set_parameters(self, parameters: CameraParameters) -> None:
         """Take new parameters, from the next frame on."""
         with self._lock:

@@ -92,7 +92,13 @@ class SimulatorParameters(Table):
     scenario: str = plain("sidereal", "simulator", "scenario to render", live=False)
     seed: int = number(1, 0, 2**31 - 1, "", "simulator", "seed of the sky and its noise", False)
     rate: float = number(
-        1.0, 0.01, 1000.0, "", "simulator", "speed against the scenario's own clock", live=False
+        1.0,
+        0.01,
+        1000.0,
+        "",
+        "simulator",
+        "speed against the scenario's own clock; 1 with a guide, whose clock is the real one",
+        live=False,
     )
     loop: bool = plain(True, "simulator", "render on beyond the scenario's last frame", live=False)
     mount_timeout_s: float = number(

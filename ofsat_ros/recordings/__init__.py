@@ -336,7 +336,7 @@ def _choose_beside(bag: Bag, image: str, msgtype: str, name: str, wanted: str | 
     """Return the topic of a type that belongs to an image topic; empty if there is none."""
     found = [topic for topic, about in bag.topics.items() if about.msgtype == msgtype]
     if wanted is not None:
-        wanted = wanted if wanted in bag.topics else f"/{wanted}"
+        wanted = wanted if wanted in bag.topics else f"/{wanted.lstrip('/')}"
         if wanted not in found:
             listing = ", ".join(found) or "none"
             raise RecordingError(f"{bag.path}: {wanted} is no {msgtype} topic; there is {listing}")
