@@ -38,7 +38,7 @@ ROSDEP_KEYS = {
 }
 PIP_NAMES = {"yaml": "PyYAML"}
 # What only some commands and tests need, and pip's extras bring: imported where it is used.
-EXTRAS = {"astropy", "ccsds_ndm", "erfa", "matplotlib", "sgp4"}
+EXTRAS = {"astropy", "ccsds_ndm", "erfa", "matplotlib", "sgp4", "xsdata"}
 DEADLINE_S = 30.0
 SAMPLE_BAG = "bags/survey_png"
 
