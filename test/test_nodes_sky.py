@@ -7,7 +7,6 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import QuaternionStamped
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from ros_graph import Graph
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
@@ -200,19 +199,6 @@ def test_a_calibration_that_does_not_count_is_said(camera, calibration, level, w
     state = camera.state(5)
     assert state.level == level
     assert words in _values(state)["directions"]
-
-
-def test_a_calibration_that_was_said_once_before_is_heard():
-    """By a sender that keeps it for those who come later."""
-    with Graph("-p", "reliable_input:=true") as graph:
-        qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        once = graph.probe.create_publisher(CameraInfo, "camera_info", qos)
-        info = CameraInfo(width=WIDTH, height=HEIGHT, distortion_model="plumb_bob")
-        info.k = [FOCAL_PX, 0.0, 80.0, 0.0, FOCAL_PX, 60.0, 0.0, 0.0, 1.0]
-        once.publish(info)
-        camera = Camera(graph, graph.add(Detector(graph.context)))
-        rows = run(camera, point_ms=())[-1]
-        assert np.isfinite(rows["sight"]).all()
 
 
 def test_an_attitude_that_is_no_rotation_is_left_out(camera):

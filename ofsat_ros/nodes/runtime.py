@@ -25,10 +25,9 @@ from importlib import resources
 from typing import Any, NoReturn
 
 import rclpy
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions, QoSPolicyKind
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
@@ -211,16 +210,13 @@ def run(
 
 
 def hear_camera_info(node: Node, take: Callable[[CameraInfo], None]) -> None:
-    """Subscribe to ``camera_info``, also to one that was said once, before this node was there."""
-    # Best effort hears every sender, and it is said again and again.
-    often = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    """Subscribe to ``camera_info``, best effort: this hears every sender."""
+    # Not for one that is kept for those who come later: asking for it makes all other senders
+    # warn of a subscriber that they cannot serve.
+    qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
     node.create_subscription(
-        CameraInfo, "camera_info", take, often, qos_overriding_options=overridable_qos()
+        CameraInfo, "camera_info", take, qos, qos_overriding_options=overridable_qos()
     )
-    # Some senders keep it for those who come later.  That others don't is no fault: no callback.
-    kept = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    quiet = SubscriptionEventCallbacks(use_default_callbacks=False)
-    node.create_subscription(CameraInfo, "camera_info", take, kept, event_callbacks=quiet)
 
 
 def prepare_for_large_images() -> None:
