@@ -171,9 +171,28 @@ def decode_compressed(data: Any, format: str = "") -> np.ndarray:  # noqa: A002 
             f"compressed image ({raw.size} bytes, {width} x {height} px, format {format!r}) is"
             " damaged or cut short"
         )
+    return luminance(image)
+
+
+def luminance(image: np.ndarray, order: str = "bgr") -> np.ndarray:
+    """Return an image as luminance, by the same weights as `decode_image`.
+
+    Parameters
+    ----------
+    image : ndarray, shape (height, width) or (height, width, channels), uint8, uint16 or float32
+        One, three or four channels; the fourth is alpha, and ignored.
+    order : {"bgr", "rgb"}
+        Of three or four channels.
+
+    Returns
+    -------
+    ndarray, shape (height, width)
+        Of the same type; the same array if it has one channel.
+    """
     if image.ndim == 2 or image.shape[2] == 1:
         return image.reshape(image.shape[:2])
-    return _to_gray(image, {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}[image.shape[2]])
+    code = cv2.COLOR_BGR2GRAY if order == "bgr" else cv2.COLOR_RGB2GRAY
+    return _to_gray(np.ascontiguousarray(image[:, :, :3]), code)
 
 
 def encode_png(image: np.ndarray) -> bytes:

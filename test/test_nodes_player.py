@@ -220,6 +220,21 @@ def test_a_truncated_message_is_skipped_and_said_once(tmp_path):
     assert "4 truncated ones skipped" in player.err
 
 
+def test_a_torn_bag_plays_what_is_whole_and_says_so(bag, tmp_path):
+    (bag / "metadata.yaml").unlink()
+    (file,) = bag.iterdir()
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with Process(tmp_path, "player", f"{file}", "--ros-args", "-p", "rate:=0") as player:
+        player.wait_for("waiting for 1 subscriber(s) to /camera/image")
+        with Graph() as graph:
+            heard = graph.listen(Image, "/camera/image")
+            assert player.wait() == 0
+            graph.serve(0.2)
+    assert f"{file.name} is not whole" in player.err.partition("waiting for")[0]
+    assert 0 < len(heard) < len(FRAMES)
+    assert stamps(heard) == TIMES[: len(heard)]
+
+
 def test_an_error_while_playing_is_no_success(bag, stop, monkeypatch):
     def broken(self, *given):
         raise OverflowError("of whatever")

@@ -1,107 +1,41 @@
-"""Bags in and out: every storage and compression, and every way a bag can be bad."""
+"""Bags in and out: every storage and compression; test_bag_salvage.py has those that are torn."""
 
 import threading
 
 import numpy as np
 import pytest
+from recorded import (
+    ENDING,
+    FIRST_NS,
+    FRAME_ID,
+    JAZZY,
+    NOETIC,
+    STORAGES,
+    TOPIC,
+    assert_holds_three_images,
+    compressed_message,
+    header_of,
+    image_message,
+    scene,
+    simple_bag,
+    stamp_of,
+    three_images,
+    write_foreign,
+)
 from rosbags.rosbag1 import Writer as Rosbag1Writer
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionMode, StoragePlugin, Writer
 from rosbags.rosbag2 import Reader as Rosbag2Reader
-from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from ofsat_ros.camera import Camera
 from ofsat_ros.images import encode_png
 from ofsat_ros.recordings import (
-    COMPRESSED_IMAGE,
     IMAGE,
     Bag,
     BagWriter,
     RecordingError,
     open_recording,
 )
-
-TOPIC = "/camera/image_raw"
-FRAME_ID = "camera_optical_frame"
-# Nanoseconds that a float could not hold.
-FIRST_NS, STEP_NS = 1_767_225_600_123_456_789, 100_000_001
-STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
-ENDING = {"mcap": ".mcap", "sqlite3": ".db3"}
-JAZZY = get_typestore(Stores.ROS2_JAZZY)
-NOETIC = get_typestore(Stores.ROS1_NOETIC)
-
-
-def scene(number, dtype="u2"):
-    return np.random.default_rng(number).integers(0, 255, (20, 30)).astype(dtype) * number
-
-
-def stamp_of(number):
-    return FIRST_NS + number * STEP_NS
-
-
-def header_of(stamp_ns, store=JAZZY, **more):
-    stamp = store.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9))
-    return store.types["std_msgs/msg/Header"](stamp=stamp, frame_id=FRAME_ID, **more)
-
-
-def image_message(pixels, stamp_ns, encoding="mono16", store=JAZZY, **header):
-    """Build a big-endian Image with padded rows: unlike what `BagWriter` writes."""
-    rows = np.full((pixels.shape[0], 2 * pixels.shape[1] + 3), 0xEE, np.uint8)
-    rows[:, :-3] = pixels.byteswap().view(np.uint8)
-    return store.types[IMAGE](
-        header=header_of(stamp_ns, store, **header),
-        height=pixels.shape[0],
-        width=pixels.shape[1],
-        encoding=encoding,
-        is_bigendian=1,
-        step=rows.shape[1],
-        data=rows.ravel(),
-    )
-
-
-def compressed_message(data, stamp_ns):
-    return JAZZY.types[COMPRESSED_IMAGE](
-        header=header_of(stamp_ns), format="png", data=np.frombuffer(data, np.uint8)
-    )
-
-
-def write_foreign(path, messages, storage="mcap", mode=CompressionMode.NONE):
-    """Write (topic, message, received_ns) with the library's own writer."""
-    writer = Writer(path, version=9, storage_plugin=STORAGES[storage])
-    writer.set_compression(mode, CompressionFormat.ZSTD)
-    with writer:
-        known = {}
-        for topic, message, received_ns in messages:
-            msgtype = message.__msgtype__
-            if topic not in known:
-                known[topic] = writer.add_connection(topic, msgtype, typestore=JAZZY)
-            writer.write(known[topic], received_ns, JAZZY.serialize_cdr(message, msgtype))
-    return path
-
-
-def three_images(topic=TOPIC):
-    # Received later than stamped, as it is in life.
-    return [(topic, image_message(scene(n), stamp_of(n)), stamp_of(n) + 5000) for n in (1, 2, 3)]
-
-
-def simple_bag(path, count=3, **options):
-    with BagWriter(path, **options) as bag:
-        for number in range(1, count + 1):
-            bag.write_image(TOPIC, scene(number), stamp_of(number), FRAME_ID)
-    return path
-
-
-def assert_holds_three_images(path, topic=None):
-    with open_recording(path, topic) as recording:
-        assert len(recording) == 3
-        frames = list(recording)
-        assert (recording.problems, recording.skipped, recording.torn) == ([], 0, "")
-    for number, frame in enumerate(frames, start=1):
-        np.testing.assert_array_equal(frame.image, scene(number))
-        assert frame.image.dtype == np.uint16
-        assert frame.stamp_ns == stamp_of(number)
-        assert frame.frame_id == FRAME_ID
-    assert len(frames) == 3
 
 
 @pytest.mark.parametrize(
@@ -149,18 +83,6 @@ def test_big_endian_padded_bags_of_another_writer_are_read(tmp_path, storage, mo
 def test_a_bare_file_is_read(tmp_path, storage):
     folder = write_foreign(tmp_path / "bag", three_images(), storage)
     assert_holds_three_images(folder / f"bag{ENDING[storage]}")
-
-
-def test_a_folder_without_metadata_is_read_when_it_holds_one_file(tmp_path):
-    folder = simple_bag(tmp_path / "bag")
-    (folder / "metadata.yaml").unlink()
-    with open_recording(folder) as recording:
-        assert len(list(recording)) == 3
-        assert len(recording.problems) == 1
-        assert "no metadata.yaml" in recording.problems[0]
-    (folder / "second.mcap").touch()
-    with pytest.raises(RecordingError, match=r"ros2 bag reindex .* one of bag.mcap, second.mcap"):
-        open_recording(folder)
 
 
 @pytest.mark.parametrize("compression", ["none", "bz2", "lz4"])
@@ -318,30 +240,16 @@ def test_a_path_that_is_no_bag_says_what_to_give(tmp_path):
         open_recording(tmp_path / "notes.txt")
 
 
-@pytest.mark.parametrize("compression", ["message", "file"])
-def test_a_bare_file_that_only_its_folder_explains_says_so(tmp_path, compression):
-    folder = simple_bag(tmp_path / "bag", compression=compression)
-    if compression == "file":
-        with pytest.raises(RecordingError, match="compressed as a file: open its folder"):
-            open_recording(folder / "bag.mcap.zstd")
-        return
-    with (
-        open_recording(folder / "bag.mcap") as recording,
-        pytest.raises(RecordingError, match=r"are compressed, .*: open the folder, .*bag$"),
-    ):
-        next(iter(recording))
-
-
 @pytest.mark.parametrize("suffix", [".mcap", ".db3", ".bag"])
 @pytest.mark.parametrize("content", [b"", b"not a bag at all" * 100])
-def test_a_file_of_something_else_is_an_error_with_a_remedy(tmp_path, suffix, content):
+def test_a_file_of_something_else_is_an_error(tmp_path, suffix, content):
     path = tmp_path / f"broken{suffix}"
     path.write_bytes(content)
-    with pytest.raises(RecordingError, match=r"cannot read .*broken.* damaged: `"):
+    with pytest.raises(RecordingError, match=r"cannot read .*: it does not begin as an? \w+"):
         open_recording(path)
 
 
-def test_what_the_system_forbids_is_said_without_a_remedy(tmp_path, monkeypatch):
+def test_what_the_system_forbids_is_said(tmp_path, monkeypatch):
     folder = simple_bag(tmp_path / "bag")
 
     def forbidden(self):
@@ -349,93 +257,6 @@ def test_what_the_system_forbids_is_said_without_a_remedy(tmp_path, monkeypatch)
 
     monkeypatch.setattr("pathlib.Path.is_dir", forbidden)
     with pytest.raises(RecordingError, match=r"cannot read .*bag: .* Permission denied$"):
-        open_recording(folder)
-
-
-@pytest.mark.parametrize("text", ["", "nonsense: [", "rosbag2_bagfile_information: 3"])
-def test_broken_metadata_is_an_error(tmp_path, text):
-    folder = simple_bag(tmp_path / "bag")
-    (folder / "metadata.yaml").write_text(text)
-    with pytest.raises(RecordingError, match="cannot read"):
-        open_recording(folder)
-
-
-@pytest.mark.parametrize("kept", [0.99, 0.7, 0.3, 0.01])
-@pytest.mark.parametrize("bare", [False, True])
-def test_a_truncated_mcap_is_an_error_with_a_remedy(tmp_path, kept, bare):
-    folder = simple_bag(tmp_path / "bag", count=20)
-    file = folder / "bag.mcap"
-    data = file.read_bytes()
-    file.write_bytes(data[: int(kept * len(data))])
-    with pytest.raises(RecordingError, match=r"cannot read .*`mcap recover \S+bag.mcap -o"):
-        open_recording(file if bare else folder)
-
-
-def large_scene(number):
-    """Noise that does not compress: a message of 1.4 MB, which fills a chunk of MCAP alone."""
-    return np.random.default_rng(number).integers(0, 65536, (800, 900)).astype(np.uint16)
-
-
-def bag_with_a_damaged_chunk(path, damaged):
-    with BagWriter(path, compression="chunk") as bag:
-        for number in range(4):
-            bag.write_image(TOPIC, large_scene(number), stamp_of(number), FRAME_ID)
-    file = path / "bag.mcap"
-    parts = file.read_bytes().split(b"\x28\xb5\x2f\xfd")  # where zstd begins
-    assert len(parts) == 5
-    before, after = parts[: damaged + 1], parts[damaged + 1 :]
-    magic = b"\x28\xb5\x2f\xfd"
-    file.write_bytes(magic.join(before) + b"oops" + magic.join(after))
-    return path
-
-
-def test_frames_before_a_damaged_chunk_are_given(tmp_path):
-    with open_recording(bag_with_a_damaged_chunk(tmp_path / "bag", 2)) as recording:
-        stamps = [frame.stamp_ns for frame in recording]
-        assert stamps == [stamp_of(0), stamp_of(1)]
-        assert recording.skipped == 2
-        assert "after 2 messages" in recording.torn
-        assert recording.problems[0] == recording.torn
-        assert "tells of 4 images" in recording.problems[1]
-        assert "only 2 could" in recording.problems[1]
-
-
-def test_a_bag_damaged_from_the_first_message_on_is_an_error(tmp_path):
-    with (
-        open_recording(bag_with_a_damaged_chunk(tmp_path / "bag", 0)) as recording,
-        pytest.raises(RecordingError, match=r"after 0 messages: .*`mcap recover"),
-    ):
-        next(iter(recording))
-
-
-def damage_database(file, share):
-    """Overwrite three pages at a share of the file."""
-    data = bytearray(file.read_bytes())
-    page = int.from_bytes(data[16:18], "big")
-    start = int(share * len(data)) // page * page
-    data[start : start + 3 * page] = b"\xff" * (3 * page)
-    file.write_bytes(data)
-
-
-def test_frames_before_a_damaged_image_in_a_database_are_given(tmp_path):
-    path = tmp_path / "bag"
-    with BagWriter(path, storage="sqlite3") as bag:
-        for number in range(4):
-            bag.write_image(TOPIC, large_scene(number), stamp_of(number), FRAME_ID)
-    damage_database(path / "bag.db3", 0.6)
-    with open_recording(path) as recording:
-        frames = list(recording)
-        assert [frame.stamp_ns for frame in frames] == [stamp_of(0), stamp_of(1)]
-        for number, frame in enumerate(frames):
-            np.testing.assert_array_equal(frame.image, large_scene(number))
-        assert recording.skipped == 2
-        assert ".recover | sqlite3" in recording.torn
-
-
-def test_a_damaged_index_of_a_database_is_an_error_with_a_remedy(tmp_path):
-    folder = simple_bag(tmp_path / "bag", count=40, storage="sqlite3")
-    damage_database(folder / "bag.db3", 0.5)
-    with pytest.raises(RecordingError, match=r"cannot read .*`sqlite3 \S+bag.db3 .recover"):
         open_recording(folder)
 
 

@@ -97,6 +97,8 @@ class Player(Node):
         self._settings = NodeParameters(self, PlayerParameters())
         own = self._settings[PlayerParameters]
         self._bag = _open(bag or own.bag)
+        for problem in self._bag.problems:
+            self.get_logger().warning(problem)
         topics = _image_topics(self._bag, own.topic)
         self._publishers_of = {name: self._publisher(name) for name in topics}
         self._beside = {

@@ -1,33 +1,53 @@
-"""A bag's messages as they were recorded, whatever its storage.
+"""A bag's messages as they were recorded, whatever its storage, and whatever became of it.
 
 Raw: ``recordings`` turns them into frames, the player publishes them as they are.
 """
 
 from __future__ import annotations
 
+import functools
+import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, Self
 
-from rosbags.interfaces import Connection
-from rosbags.rosbag1 import Reader as Rosbag1Reader
-from rosbags.rosbag2 import Reader as Rosbag2Reader
+import yaml
 from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
+
+from ofsat_ros.recordings.salvage import Channel, WreckError
+from ofsat_ros.recordings.storage import SUFFIXES, Storage, suffix_of, zstd
+
+__all__ = [
+    "ATTITUDE",
+    "CAMERA_INFO",
+    "COMPRESSED_IMAGE",
+    "IMAGE",
+    "SUFFIXES",
+    "Bag",
+    "RecordingError",
+    "Topic",
+]
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 ATTITUDE = "geometry_msgs/msg/QuaternionStamped"
-SUFFIXES = (".mcap", ".db3", ".bag")
 
+_METADATA = "metadata.yaml"
 _ZSTD = b"\x28\xb5\x2f\xfd"  # never the first bytes of CDR
+# How a recorder names the files of a bag that it splits.
+_SPLIT = re.compile(r"(?P<bag>.+)_(?P<number>\d+)(?:\.mcap|\.db3|\.bag)(?:\.zstd|\.active)?")
 
-_REMEDIES = {
-    ".mcap": "`mcap recover {file} -o recovered.mcap` saves what is whole",
-    ".db3": "`sqlite3 {file} .recover | sqlite3 recovered.db3` saves what is whole",
-    ".bag": "`rosbag reindex {file}` saves what is whole",
-}
+
+@functools.cache
+def typestore() -> Typestore:
+    """Return what converts messages; it compiles each type once.
+
+    Also for ROS 1: the conversion to CDR goes by ROS 2's definitions, without Header.seq.
+    """
+    return get_typestore(Stores.ROS2_JAZZY)
 
 
 class RecordingError(Exception):
@@ -50,6 +70,8 @@ class Topic:
 class Bag:
     """Messages of a bag as they were recorded; a context manager.
 
+    A file that is torn, half written or damaged gives every message that is whole.
+
     Parameters
     ----------
     path : str or Path
@@ -59,11 +81,12 @@ class Bag:
     ----------
     path : Path
     topics : dict of str to Topic
-        Every topic of the bag, images or not.
+        Every topic of the bag, images or not; counts are those that its metadata tells of, if
+        that is more than there is.
     start_ns : int
         Time at which the first message was received, ns.
     problems : list of str
-        What was odd at opening.
+        What was odd at opening, and what turned out not to be whole while reading.
 
     Raises
     ------
@@ -74,31 +97,21 @@ class Bag:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.problems: list[str] = []
-        # Also for ROS 1: the conversion to CDR goes by ROS 2's definitions, without Header.seq.
-        self._typestore = get_typestore(Stores.ROS2_JAZZY)
-        try:
-            storage = self._storage()
-            self._ros1 = storage.suffix == ".bag"
-            self._reader = Rosbag1Reader(storage) if self._ros1 else Rosbag2Reader(storage)
-            self._reader.open()
-        except RecordingError:
-            raise
-        # A damaged file makes the readers raise nearly anything: their own errors, those of
-        # the database and of the decompressor, struct, assertion and key errors.
-        except Exception as error:
-            raise self._unreadable(error) from error
+        self._typestore = typestore()
+        self._storages: list[Storage] = []
+        self._said: set[str] = set()  # topics with a damaged message
         self._is_open = True
-        self.topics = {
-            name: Topic(about.connections[0].msgtype, about.msgcount)
-            for name, about in self._reader.topics.items()
-        }
-        self.start_ns = int(self._reader.start_time)
-        if not sum(about.count for about in self.topics.values()):
+        try:
+            files, told = self._files()
+            self._open(files)
+            self.topics = _topics(self._storages, told)
+            self.start_ns = self._start_ns()
+        except OSError as error:
             self.close()
-            raise RecordingError(
-                f"{self.path} holds no messages: was the camera's topic recorded?"
-                " (`ros2 topic list` shows the topics to record)"
-            )
+            raise self._unreadable(error) from error
+        except BaseException:
+            self.close()
+            raise
 
     def __enter__(self) -> Self:
         return self
@@ -108,14 +121,16 @@ class Bag:
 
     def close(self) -> None:
         """Close the files; a second call does nothing."""
-        if self._is_open:
-            self._is_open = False
-            self._reader.close()
+        self._is_open = False
+        while self._storages:
+            self._storages.pop().close()
 
     def messages(
         self, topics: Collection[str], start_ns: int | None = None
     ) -> Iterator[tuple[str, str, int, bytes]]:
         """Yield (topic, message type, time received in ns, CDR bytes) in the order of time.
+
+        What is not whole is left out and told in `problems`.
 
         Parameters
         ----------
@@ -127,35 +142,35 @@ class Bag:
         Raises
         ------
         RecordingError
-            If the bag is damaged from some message on, or closed.
+            If the bag can no longer be read, or is closed.
         """
         if not self._is_open:
             raise RecordingError(f"{self.path} is closed: open it again to read it")
-        chosen = [about for about in self._reader.connections if about.topic in topics]
         count = 0
         try:
-            for about, received_ns, data in self._read(chosen, start_ns):
-                yield about.topic, about.msgtype, received_ns, data
-                count += 1
-        except RecordingError:
-            raise
-        except Exception as error:  # see __init__
+            for storage in self._storages:
+                for channel, received_ns, data in storage.messages(topics, start_ns):
+                    cdr = self._as_cdr(channel, received_ns, data)
+                    if cdr is not None:
+                        yield channel.topic, channel.msgtype, received_ns, cdr
+                        count += 1
+        except (OSError, WreckError) as error:
             raise self._unreadable(error, f"after {count} messages") from error
 
-    def _read(
-        self, chosen: list[Connection], start_ns: int | None
-    ) -> Iterator[tuple[Connection, int, bytes]]:
-        if not chosen:  # which the readers would take for: all
-            return
-        for about, received_ns, data in self._reader.messages(chosen, start=start_ns):
+    def _as_cdr(self, channel: Channel, received_ns: int, data: bytes) -> bytes | None:
+        """Return a message as ROS 2 serializes it; None if it is damaged, which is said."""
+        try:
             if data[:4] == _ZSTD:
-                raise RecordingError(
-                    f"the messages in {self.path} are compressed, as only the metadata.yaml beside"
-                    f" it tells: open the folder, {self.path.parent}"
-                )
-            if self._ros1:
-                data = bytes(self._typestore.ros1_to_cdr(data, about.msgtype))
-            yield about, received_ns, data
+                data = zstd.decompress(data)
+            if channel.encoding == "ros1":
+                data = bytes(self._typestore.ros1_to_cdr(data, channel.msgtype))
+        # Damaged bytes: the decompressor's own error, struct, key, index errors and others.
+        except Exception as error:  # noqa: BLE001
+            if channel.topic not in self._said:
+                self._said.add(channel.topic)
+                self.problems.append(f"{channel.topic}: a damaged message is left out: {error}")
+            return None
+        return data
 
     def deserialize(self, data: bytes, msgtype: str) -> Any:
         """Return a message of `messages` as an object with the message's fields.
@@ -172,50 +187,102 @@ class Bag:
             reason = f"{error}" or type(error).__name__
             raise RecordingError(f"the message is damaged: {reason}") from error
 
-    def _storage(self) -> Path:
-        """Return the folder or file that the reader is to open."""
+    def _files(self) -> tuple[list[Path], dict[str, Topic]]:
+        """Return the files to read, in their order, and the topics that the metadata tells of."""
         path = self.path
         if not path.exists():
             raise RecordingError(f"{path} does not exist: check the path")
         if path.is_dir():
-            return path if (path / "metadata.yaml").exists() else self._only_file(path)
-        if path.suffix == ".zstd":
-            raise RecordingError(f"{path} is compressed as a file: open its folder, {path.parent}")
-        if path.suffix not in SUFFIXES:
+            return self._told_files() or (self._found_files(), {})
+        if not suffix_of(path):
             raise RecordingError(
                 f"{path} is no recording known here: give a rosbag2 folder, or a file that ends in"
                 f" {', '.join(SUFFIXES)}"
             )
-        return path
+        return [path], {}
 
-    def _only_file(self, folder: Path) -> Path:
-        """Return the only storage file of a folder that has no metadata."""
-        files = sorted(file for file in folder.iterdir() if file.suffix in SUFFIXES)
+    def _told_files(self) -> tuple[list[Path], dict[str, Topic]] | None:
+        """Return what the metadata of a folder tells; None if there is nothing to go by."""
+        try:
+            told = yaml.safe_load((self.path / _METADATA).read_text())
+            told = told["rosbag2_bagfile_information"]
+            files = [self.path / PurePath(name).name for name in told["relative_file_paths"]]
+            topics = {
+                about["topic_metadata"]["name"]: Topic(
+                    about["topic_metadata"]["type"], int(about["message_count"])
+                )
+                for about in told["topics_with_message_count"]
+            }
+        except FileNotFoundError:
+            self.problems.append(f"{self.path} has no {_METADATA} (was the recorder killed?)")
+            return None
+        except (yaml.YAMLError, UnicodeDecodeError, LookupError, TypeError, ValueError) as error:
+            reason = f"{error}".partition("\n")[0]
+            self.problems.append(f"{self.path / _METADATA} is damaged and not used: {reason}")
+            return None
+        missing = [file.name for file in files if not file.exists()]
+        if missing:
+            self.problems.append(
+                f"{self.path / _METADATA} tells of files that are missing: {', '.join(missing)}"
+            )
+        there = [file for file in files if file.exists() and suffix_of(file)]
+        return (there, topics) if there else None
+
+    def _found_files(self) -> list[Path]:
+        """Return the files of a folder if they are one bag's, by their names."""
+        files = [file for file in sorted(self.path.iterdir()) if suffix_of(file)]
+        # A recorder that was killed may have left a file beside its half-written compression.
+        files = [file for file in files if file.with_suffix("") not in files]
         if not files:
             raise RecordingError(
-                f"{folder} is no bag: it has neither a metadata.yaml nor a file that ends in"
+                f"{self.path} is no bag: it has neither a {_METADATA} nor a file that ends in"
                 f" {', '.join(SUFFIXES)}"
             )
-        if len(files) > 1:
+        if len(files) == 1:
+            return files
+        parts = [(_SPLIT.fullmatch(file.name), file) for file in files]
+        numbers = {file: int(part["number"]) for part, file in parts if part}
+        if len(numbers) < len(files) or len({part["bag"] for part, _ in parts if part}) > 1:
             raise RecordingError(
-                f"{folder} has no metadata.yaml but several files: rebuild it with"
-                f" `ros2 bag reindex {folder}`, or open one of"
-                f" {', '.join(file.name for file in files)}"
+                f"{self.path} holds several files, and nothing tells that they are one bag: open"
+                f" one of {', '.join(file.name for file in files)}"
             )
-        self.problems.append(
-            f"{folder} has no metadata.yaml (was the recorder killed?); read {files[0].name} alone"
+        return sorted(files, key=numbers.__getitem__)
+
+    def _open(self, files: list[Path]) -> None:
+        """Open the files; those that are none of a bag are left out and said."""
+        reasons = []
+        for file in files:
+            try:
+                self._storages.append(Storage(file, self.problems))
+            except WreckError as error:
+                reasons.append(f"{error}" if file == self.path else f"{file.name}: {error}")
+        if not self._storages:
+            reasons = [*self.problems, *reasons]
+            raise RecordingError(f"cannot read {self.path}: {'; '.join(reasons)}")
+        self.problems.extend(f"cannot read {reason}" for reason in reasons)
+
+    def _start_ns(self) -> int:
+        starts = [about.start_ns for about in self._storages if about.start_ns is not None]
+        if starts:
+            return min(starts)
+        why = "; ".join(self.problems) or (
+            "was the camera's topic recorded? (`ros2 topic list` shows the topics to record)"
         )
-        return files[0]
+        raise RecordingError(f"{self.path} holds no messages: {why}")
 
     def _unreadable(self, error: Exception, where: str = "") -> RecordingError:
-        """Return what to say about whatever a reader raised."""
         reason = f"{error}".rstrip(".") or type(error).__name__
-        place = f"{self.path} {where}".rstrip()
-        if isinstance(error, OSError):  # the system's fault, not the file's
-            return RecordingError(f"cannot read {place}: {reason}")
-        inside = [self.path, *(self.path.iterdir() if self.path.is_dir() else ())]
-        files = [file for file in inside if file.suffix in _REMEDIES]
-        remedy = _REMEDIES[files[0].suffix].format(file=files[0]) if files else "record it again"
-        return RecordingError(
-            f"cannot read {place}: {reason}. If it is cut short or damaged: {remedy}"
-        )
+        return RecordingError(f"cannot read {f'{self.path} {where}'.rstrip()}: {reason}")
+
+
+def _topics(storages: list[Storage], told: dict[str, Topic]) -> dict[str, Topic]:
+    """Return all topics of some files and of the metadata, by their names."""
+    found: dict[str, Topic] = {}
+    for channel, count in (pair for storage in storages for pair in storage.channels):
+        before = found.get(channel.topic, Topic(channel.msgtype, 0))
+        found[channel.topic] = Topic(before.msgtype, before.count + count)
+    for name, about in told.items():
+        there = found.get(name, Topic(about.msgtype, 0))
+        found[name] = Topic(there.msgtype, max(there.count, about.count))
+    return dict(sorted(found.items()))

@@ -1,8 +1,12 @@
-"""Images and messages into a new rosbag2 folder: for the simulator and the recorder."""
+"""Images and messages into a new rosbag2 folder."""
 
 from __future__ import annotations
 
+import signal
 import sqlite3
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
 
@@ -17,7 +21,7 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer, WriterError
-from rosbags.typesys import Stores, TypesysError, get_typestore
+from rosbags.typesys import TypesysError
 from scipy.spatial.transform import Rotation
 
 from ofsat_ros.camera import Camera
@@ -29,9 +33,10 @@ from ofsat_ros.recordings.bag import (
     IMAGE,
     SUFFIXES,
     RecordingError,
+    typestore,
 )
+from ofsat_ros.recordings.messages import header_message, message_type, serialized
 
-_NS = 1_000_000_000
 _STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 _COMPRESSIONS = {
     "none": CompressionMode.NONE,
@@ -57,7 +62,8 @@ _QOS = Qos(
 class BagWriter:
     """Writes a rosbag2 folder; a context manager.
 
-    The bag is closed, and so is readable, also when an exception or Ctrl-C ends the ``with``.
+    The bag is closed, and so is readable, also when an exception or Ctrl-C ends the ``with``; no
+    message is cut by it.
 
     Parameters
     ----------
@@ -90,15 +96,23 @@ class BagWriter:
                 "only mcap is compressed by chunk: use message or file for sqlite3"
             )
         if self.path.exists() or self.path.is_symlink():
-            _make_way(self.path, force)
-        self._typestore = get_typestore(Stores.ROS2_JAZZY)
+            if not force:
+                raise RecordingError(
+                    f"{path} exists: choose another path, or --force (force=True) to replace it"
+                )
+            remove_bag(self.path)
         self._connections: dict[str, Connection] = {}
+        typestore()  # which takes a while, and Ctrl-C might come
         try:
-            self._writer: Writer | None = Writer(self.path, version=9, storage_plugin=plugin)
-            self._writer.set_compression(mode, CompressionFormat.ZSTD)
-            self._writer.open()
+            with _uninterrupted():
+                self._writer: Writer | None = Writer(self.path, version=9, storage_plugin=plugin)
+                self._writer.set_compression(mode, CompressionFormat.ZSTD)
+                self._writer.open()
         except (OSError, WriterError) as error:
             raise RecordingError(f"cannot write {self.path}: {error}") from error
+        except KeyboardInterrupt:
+            self.close()
+            raise
 
     def __enter__(self) -> Self:
         return self
@@ -142,12 +156,13 @@ class BagWriter:
             connection = self._connections.get(topic)
             if connection is None:
                 connection = self._writer.add_connection(
-                    topic, msgtype, typestore=self._typestore, offered_qos_profiles=[_QOS]
+                    topic, msgtype, typestore=typestore(), offered_qos_profiles=[_QOS]
                 )
                 self._connections[topic] = connection
             if connection.msgtype != msgtype:
                 raise RecordingError(f"{topic} holds {connection.msgtype}, not {msgtype}")
-            self._writer.write(connection, int(stamp_ns), data)
+            with _uninterrupted():
+                self._writer.write(connection, int(stamp_ns), data)
         except TypesysError as error:
             raise RecordingError(f"{msgtype} is no message type known here: {error}") from error
         except (OSError, sqlite3.Error) as error:
@@ -190,7 +205,6 @@ class BagWriter:
 
     def write_camera_info(self, topic: str, camera: Camera, stamp_ns: int, frame_id: str) -> None:
         """Write a camera's calibration as sensor_msgs/CameraInfo; raises as `write_image`."""
-        types = self._typestore.types
         k = camera.matrix
         fields = {
             "width": camera.width,
@@ -200,31 +214,41 @@ class BagWriter:
             "k": k.ravel(),
             "r": np.eye(3).ravel(),
             "p": np.column_stack([k, np.zeros(3)]).ravel(),
-            "binning_x": 0,
-            "binning_y": 0,
-            "roi": types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, do_rectify=False),
         }
         self._write_stamped(topic, CAMERA_INFO, stamp_ns, frame_id, fields)
 
     def write_attitude(self, topic: str, attitude: Rotation, stamp_ns: int, frame_id: str) -> None:
         """Write the rotation ICRS -> optical frame; raises as `write_image`."""
-        types = self._typestore.types
         x, y, z, w = attitude.as_quat().tolist()
-        fields = {"quaternion": types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)}
-        self._write_stamped(topic, ATTITUDE, stamp_ns, frame_id, fields)
+        quaternion = message_type("geometry_msgs/msg/Quaternion")(x=x, y=y, z=z, w=w)
+        self._write_stamped(topic, ATTITUDE, stamp_ns, frame_id, {"quaternion": quaternion})
+
+    def write_message(self, topic: str, message: Any, stamp_ns: int) -> None:
+        """Write a message of a `message_type` at a time, ns; raises as `write`."""
+        self.write(topic, message.__msgtype__, serialized(message), stamp_ns)
 
     def _write_stamped(
         self, topic: str, msgtype: str, stamp_ns: int, frame_id: str, fields: dict[str, Any]
     ) -> None:
         """Write a message with a header, at the time of its stamp."""
-        types = self._typestore.types
-        sec, nanosec = divmod(int(stamp_ns), _NS)
-        if not 0 <= sec < 2**31:
-            raise RecordingError(f"{topic}: a header cannot hold the stamp {stamp_ns} ns")
-        stamp = types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
-        header = types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame_id)
-        message = types[msgtype](header=header, **fields)
-        self.write(topic, msgtype, self._typestore.serialize_cdr(message, msgtype), stamp_ns)
+        header = header_message(stamp_ns, frame_id)
+        self.write_message(topic, message_type(msgtype)(header=header, **fields), stamp_ns)
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Have Ctrl-C wait: half a message would spoil those around it."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # where Ctrl-C never comes
+        return
+    came: list[int] = []
+    usual = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, usual or signal.SIG_DFL)
+        if came:
+            signal.raise_signal(signal.SIGINT)
 
 
 def _pick(word: str, known: dict[str, Any], what: str) -> Any:
@@ -233,12 +257,14 @@ def _pick(word: str, known: dict[str, Any], what: str) -> Any:
     return known[word]
 
 
-def _make_way(path: Path, force: bool) -> None:
-    """Remove a bag, or say why not."""
-    if not force:
-        raise RecordingError(
-            f"{path} exists: choose another path, or --force (force=True) to replace it"
-        )
+def remove_bag(path: Path) -> None:
+    """Remove a bag's folder, and never anything else.
+
+    Raises
+    ------
+    RecordingError
+        If it is no bag, or holds something beside it.
+    """
     bag = path.is_dir() and not path.is_symlink() and (path / "metadata.yaml").exists()
     inside = sorted(path.iterdir()) if bag else []
     foreign = [f.name for f in inside if not (f.name == "metadata.yaml" or _is_storage(f))]

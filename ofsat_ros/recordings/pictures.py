@@ -1,0 +1,159 @@
+"""Folders of pictures: PNG, TIFF, JPEG and BMP."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ofsat_ros.images import EncodingError, decode_compressed, luminance
+from ofsat_ros.recordings.bag import RecordingError
+from ofsat_ros.recordings.recording import FRAME_ID, Attitude, Frame, Skipped
+from ofsat_ros.recordings.timing import NS, Shot, in_order
+
+_KINDS = {
+    **{".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF"},
+    **{".jpg": "JPEG", ".jpeg": "JPEG", ".bmp": "BMP"},
+}
+SUFFIXES = tuple(_KINDS)
+
+# Tags of EXIF 2.32 (CIPA DC-008): time, its fraction and its distance from UTC, exposure time.
+_ORIGINAL, _FRACTION, _OFFSET, _EXPOSURE = 0x9003, 0x9291, 0x9011, 0x829A
+_EXIF = 0x8769
+_TIME = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)")
+_ZONE = re.compile(r"([+-])(\d\d):(\d\d)")
+_SELF_CHECKING = (b"\x89PNG", b"\xff\xd8\xff")
+
+
+class PictureSource:
+    """Picture files as a `Source`.
+
+    Parameters
+    ----------
+    path : Path
+        Where they are, for messages.
+    files : list of Path
+    fps, exposure_s
+        As in `open_recording`.
+    """
+
+    kind = "images"
+    topic = camera_info_topic = attitude_topic = ""
+    last_attitudes: tuple[Attitude, ...] = ()
+
+    def __init__(
+        self, path: Path, files: list[Path], fps: float | None, exposure_s: float | None
+    ) -> None:
+        self.path = path
+        self.topics: dict[str, int] = {}
+        self.problems: list[str] = []
+        files = self._of_one_kind(files)
+        shots = [self._look(file, exposure_s) for file in files]
+        if not fps and not _has_pillow():
+            raise RecordingError(
+                f"{path}: give the rate of the pictures, as in --fps 2, or, for their own times,"
+                " pip install 'ofsat_ros[exif]' (on Debian and Ubuntu apt install python3-pil)"
+            )
+        self._shots, odd = in_order(shots, path, fps)
+        self.problems += odd
+        self.count = len(self._shots)
+
+    def close(self) -> None:
+        """See `Source`."""
+
+    def frames(self, say: Callable[[str], None]) -> Iterator[Frame | Skipped]:
+        """See `Source`."""
+        for number, shot in enumerate(self._shots):
+            name = f"frame {number} ({shot.name})"
+            if shot.reason or shot.stamp_ns is None:
+                yield Skipped(name, shot.reason)
+                continue
+            try:
+                image = _decoded(shot.file)
+            except (OSError, EncodingError) as error:
+                yield Skipped(name, f"{error}")
+                continue
+            yield Frame(image, shot.stamp_ns, FRAME_ID, number, exposure_s=shot.exposure_s)
+
+    def _of_one_kind(self, files: list[Path]) -> list[Path]:
+        """Return the files of the most frequent kind: others are previews, or results."""
+        kinds = Counter(_KINDS[file.suffix.lower()] for file in files)
+        ((most, count), *others) = kinds.most_common()
+        if others:
+            words = ", ".join(f"{number} {kind}" for kind, number in others)
+            self.problems.append(f"of the {count} {most} and {words} files, only {most} are read")
+        return [file for file in files if _KINDS[file.suffix.lower()] == most]
+
+    def _look(self, file: Path, exposure_s: float | None) -> Shot:
+        tags = _exif(file)
+        found = _TIME.match(str(tags.get(_ORIGINAL, "")))
+        own_s = float(tags.get(_EXPOSURE, 0) or 0)
+        exposure_s = own_s if 0 < own_s < 1e5 else exposure_s
+        if not found:
+            return Shot(file, exposure_s=exposure_s)
+        digits = re.match(r"\d{1,9}", str(tags.get(_FRACTION, "")))
+        text = "{}-{}-{}T{}".format(*found.groups()) + (f".{digits[0]}" if digits else "")
+        try:
+            stamp_ns = int(np.datetime64(text, "ns").astype(np.int64))
+        except ValueError:
+            return Shot(file, exposure_s=exposure_s)
+        zone = _ZONE.match(str(tags.get(_OFFSET, "")))
+        if zone:
+            sign, hours, minutes = zone.groups()
+            stamp_ns -= int(f"{sign}1") * (int(hours) * 60 + int(minutes)) * 60 * NS
+        else:
+            self._say_once(
+                "the pictures do not tell their time zone: their times are taken as UTC"
+            )
+        self._say_once(
+            "stamps are the pictures' own times, taken for the begin of the exposures; half of an"
+            " exposure that is known is added"
+        )
+        return Shot(file, (), stamp_ns + round((exposure_s or 0) * NS / 2), exposure_s)
+
+    def _say_once(self, words: str) -> None:
+        if words not in self.problems:
+            self.problems.append(words)
+
+
+def _decoded(file: Path) -> np.ndarray:
+    data = file.read_bytes()
+    if data.startswith(_SELF_CHECKING):
+        return decode_compressed(data, file.suffix)
+    if data[:2] == b"BM" and len(data) < int.from_bytes(data[2:6], "little"):
+        raise EncodingError("the file is cut short")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise EncodingError(f"it cannot be decoded: {error}") from error
+    if image is None:
+        raise EncodingError("it is damaged, cut short, or no picture that OpenCV reads")
+    if image.dtype not in (np.uint8, np.uint16, np.float32):
+        image = image.astype(np.float32)
+    return luminance(image)
+
+
+def _exif(file: Path) -> dict[int, Any]:
+    """Return what the camera wrote into a picture; empty if nothing, or nothing can read it."""
+    try:
+        from PIL import Image, UnidentifiedImageError
+    except ImportError:
+        return {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of tags that are damaged
+        try:
+            with Image.open(file) as picture:
+                return dict(picture.getexif().get_ifd(_EXIF))
+        except (OSError, SyntaxError, ValueError, UnidentifiedImageError):
+            return {}
+
+
+def _has_pillow() -> bool:
+    return importlib.util.find_spec("PIL") is not None

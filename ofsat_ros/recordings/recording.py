@@ -1,0 +1,244 @@
+"""Frames of any recording, read ahead in a thread: what stands before the pipeline offline.
+
+A `Source` knows one kind of file; `Recording` is what they all look like from outside.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, Self
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ofsat_ros.camera import Camera
+from ofsat_ros.recordings.bag import RecordingError
+
+# Of images that come with none: as a camera driver's would be called.
+FRAME_ID = "camera_optical_frame"
+
+_PROBLEMS_KEPT = 10
+# Frames that are read while one is in work; more would only take memory.
+_AHEAD = 2
+
+
+# A stamp, ns UTC, and the rotation from ICRS to the optical frame then.
+Attitude = tuple[int, Rotation]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image of a recording.
+
+    Attributes
+    ----------
+    image : ndarray, shape (height, width), uint8, uint16 or float32
+        Luminance, native byte order.
+    stamp_ns : int
+        ns UTC; of a bag, the stamp of the header; else the middle of the exposure as far as it
+        is known, and the recording's problems tell if it is not.
+    frame_id : str
+        Coordinate frame of the header.
+    number : int
+        Its place among the images of the recording, those that could not be decoded included.
+    camera : Camera or None
+        The calibration recorded before it, or in its header; None if there is none.
+    attitudes : tuple of Attitude
+        Those recorded since the frame before; at its stamp, if its header has one.
+    exposure_s : float or None
+        Length of the exposure, s; None if it is not known.
+    """
+
+    image: np.ndarray
+    stamp_ns: int
+    frame_id: str
+    number: int = 0
+    camera: Camera | None = None
+    attitudes: tuple[Attitude, ...] = ()
+    exposure_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """A frame that cannot be given: which one it is, as in "frame 3 of /image", and why."""
+
+    name: str
+    reason: str
+
+
+class Source(Protocol):
+    """One kind of recording.  All that it does is done in one thread.
+
+    Attributes
+    ----------
+    path : Path
+    kind : str
+        As in `Recording`.
+    count : int
+        Frames that the file's index tells of.
+    topics, topic, camera_info_topic, attitude_topic
+        As in `Recording`.
+    problems : list of str
+        What was odd at opening.
+    """
+
+    path: Path
+    kind: str
+    count: int
+    topics: dict[str, int]
+    topic: str
+    camera_info_topic: str
+    attitude_topic: str
+    problems: list[str]
+
+    @property
+    def last_attitudes(self) -> tuple[Attitude, ...]:
+        """Attitudes recorded after the last frame; complete when `frames` has ended."""
+
+    def frames(self, say: Callable[[str], None]) -> Iterator[Frame | Skipped]:
+        """Yield every frame from the first on, or why one is skipped.
+
+        Parameters
+        ----------
+        say : callable
+            Takes what the user should know of this look at the recording.
+
+        Raises
+        ------
+        RecordingError
+            If nothing more can be read.
+        """
+
+    def close(self) -> None:
+        """Close the files."""
+
+
+class Recording:
+    """The frames of a recording; a context manager.
+
+    Iterating yields every `Frame` in the order of the recording, each read and decoded ahead in a
+    thread while the one before is in work.  A frame that cannot be decoded is left out, counted
+    and named; so is the rest of a recording that is damaged from some frame on.
+
+    Attributes
+    ----------
+    path : Path
+    kind : str
+        ``rosbag2``, ``ROS 1 bag``, ``FITS``, ``SER``, ``video`` or ``images``.
+    topic : str
+        The topic read; empty if the recording is no bag.
+    camera_info_topic, attitude_topic : str
+        Those read with it; empty if there is none.
+    topics : dict of str to int
+        Image topics of the recording and their counts of frames; empty if it is no bag.
+    skipped : int
+        Frames that the last iteration could not give.
+    torn : str
+        Why the last iteration ended before the recording's end; empty if it did not.
+    seconds : float
+        Time that the last iteration's reading and decoding took, in its own thread, s.
+    """
+
+    def __init__(self, source: Source, thread: ThreadPoolExecutor) -> None:
+        self._source = source
+        # All that the source does is done in this one thread, which SQLite may ask for.
+        self._thread: ThreadPoolExecutor | None = thread
+        self._coming: deque[Future[Frame | None]] = deque()
+        self.path, self.kind, self.topics = source.path, source.kind, source.topics
+        self.topic = source.topic
+        self.camera_info_topic = source.camera_info_topic
+        self.attitude_topic = source.attitude_topic
+        self._start_over()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the files; a second call does nothing."""
+        thread, self._thread = self._thread, None
+        if thread is None:
+            return
+        self._give_up()
+        thread.submit(self._source.close).result()
+        thread.shutdown()
+
+    def __len__(self) -> int:
+        """Return the count of frames that the recording's index tells of."""
+        return self._source.count
+
+    @property
+    def problems(self) -> list[str]:
+        """What the user should know of the recording and of the last iteration.
+
+        Why frames were skipped (the first ones), stamps that were missing, an index that does
+        not agree.  Complete when the iteration has ended.
+        """
+        return [*self._source.problems, *self._said]
+
+    @property
+    def last_attitudes(self) -> tuple[Attitude, ...]:
+        """Attitudes recorded after the last frame; complete when the iteration has ended."""
+        return self._source.last_attitudes
+
+    def __iter__(self) -> Iterator[Frame]:
+        if self._thread is None:
+            raise RecordingError(f"{self.path} is closed: open it again to read it")
+        self._give_up()
+        frames = self._read()
+        coming = deque(self._thread.submit(self._next, frames) for _ in range(_AHEAD))
+        self._coming = coming
+        while coming and (frame := coming.popleft().result()) is not None:
+            coming.append(self._thread.submit(self._next, frames))
+            yield frame
+
+    def _give_up(self) -> None:
+        """Read no further ahead; an iteration that is under way ends."""
+        while self._coming:
+            self._coming.pop().cancel()
+
+    def _next(self, frames: Iterator[Frame]) -> Frame | None:
+        start_s = time.perf_counter()
+        frame = next(frames, None)
+        self.seconds += time.perf_counter() - start_s
+        return frame
+
+    def _read(self) -> Iterator[Frame]:
+        self._start_over()
+        count = 0
+        try:
+            for given in self._source.frames(self._said.append):
+                count += 1
+                if isinstance(given, Frame):
+                    yield given
+                else:
+                    self._skip(given)
+        except RecordingError as error:
+            if not count:
+                raise
+            self.torn = f"{error}"
+            self._said.append(self.torn)
+        if count < len(self):
+            self.skipped += len(self) - count
+            on = f" on {self.topic}" if self.topic else ""
+            self._said.append(
+                f"{self.path} tells of {len(self)} images{on}, but only {count} could be read"
+            )
+
+    def _start_over(self) -> None:
+        self.skipped = 0
+        self.torn = ""
+        self.seconds = 0.0
+        self._said: list[str] = []
+
+    def _skip(self, frame: Skipped) -> None:
+        self.skipped += 1
+        if self.skipped <= _PROBLEMS_KEPT:
+            self._said.append(f"{frame.name} skipped: {frame.reason}")
