@@ -11,7 +11,8 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from ofsat_ros.camera import Astrometry, Camera
 from ofsat_ros.pipeline import FrameResult, ImageError, Pipeline
 from ofsat_ros.recordings import Attitude, Frame, Recording
 from ofsat_ros.results import ResultWriter, in_words
+from ofsat_ros.results.bag import ResultBag
 from ofsat_ros.tracking import Settled
 from ofsat_ros.tracking_data import TrackArcs
 
@@ -28,11 +30,16 @@ Detections = NDArray[np.void]
 
 
 class Totals:
-    """Counts and times for the summary."""
+    """Counts, times and notes, for the summary and for ``run.json``."""
 
     def __init__(self) -> None:
         self.frames = self.left_out = 0
-        self.detections: Counter[int] = Counter()
+        self.width: int | None = None
+        self.height: int | None = None
+        self.first_stamp_ns: int | None = None  # middle of the exposure, as in all files
+        self.last_stamp_ns: int | None = None
+        self.problems: list[str] = []
+        self.detections: Counter[int] = Counter()  # by track; 0 stands for candidates
         self.unlocated: Counter[str] = Counter()  # detections without direction, by the reason
         self.reason = ""
         self.reading_s = 0.0  # in its own thread, beside all others
@@ -49,6 +56,29 @@ class Totals:
             taken_s = time.perf_counter() - start_s
             for part, seconds in (*parts.items(), (stage, taken_s - sum(parts.values()))):
                 self._seconds[part] += seconds
+
+    def add_frame(self, result: FrameResult) -> None:
+        """Count a frame."""
+        self.frames += 1
+        self.reason = result.reason
+        self.height, self.width = result.shape
+        self.last_stamp_ns = result.stamp_ns
+        if self.first_stamp_ns is None:
+            self.first_stamp_ns = result.stamp_ns
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what ``run.json`` says of them."""
+        same = ("frames", "left_out", "width", "height", "first_stamp_ns", "last_stamp_ns")
+        candidates = self.detections[0]
+        return {
+            **{name: getattr(self, name) for name in same},
+            "detections": self.detections.total() - candidates,
+            "candidates": candidates,
+            "tracks": sum(1 for track_id in self.detections if track_id),
+            "problems": self.problems,
+            "unlocated": dict(self.unlocated),
+            "profile": {**self._seconds, "reading, meanwhile": self.reading_s},
+        }
 
     def profile(self) -> str:
         """Return a table of where the time went."""
@@ -68,6 +98,17 @@ class Totals:
         if not self.detections and self.reason:
             words += f"; the last frame says: {self.reason}"
         return words
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A frame that the pipeline has processed, until the last word on it is said."""
+
+    number: int  # in the recording, which counts those that could not be decoded, too
+    stamp_ns: int  # of its header
+    frame_id: str
+    camera: Camera | None
+    result: FrameResult
 
 
 class Processing:
@@ -102,23 +143,36 @@ class Processing:
         self._pipeline, self._astrometry = pipeline, astrometry
         self._arcs, self._live, self._say = arcs, live, say
         self._writer: ResultWriter
+        self._bag: ResultBag | None
         self._refused = 0
         self._misfit = self._calibrated = False
-        # Of each frame by the pipeline's number: that in the recording, which counts those that
-        # could not be decoded, too, and its calibration.
-        self._frames: dict[int, tuple[int, Camera | None]] = {}
+        self._seen: dict[int, _Seen] = {}  # by the pipeline's number
         self._settled: list[Settled] = []  # until the attitudes after their frames are known
 
-    def run(self, frames: Recording, writer: ResultWriter) -> None:
+    def run(self, frames: Recording, writer: ResultWriter, bag: ResultBag | None = None) -> None:
         """Process every frame; what was done is written whatever ends it.
+
+        Parameters
+        ----------
+        frames : Recording
+        writer : ResultWriter
+        bag : ResultBag, optional
+            Gets the same detections; the tracks are as they were known at their frame.
 
         Raises
         ------
         RecordingError, OSError
             If a file cannot be read, or written.
         """
-        totals, self._writer = self.totals, writer
-        coming = iter(tqdm(frames, unit=" frames", dynamic_ncols=True, disable=None))
+        totals, self._writer, self._bag = self.totals, writer, bag
+        bar = tqdm(
+            frames,
+            total=len(frames) or None,
+            unit=" frames",
+            dynamic_ncols=True,
+            disable=None,  # where nobody watches
+        )
+        coming = iter(bar)
         try:
             while True:
                 with totals.timed("waiting for frames"):
@@ -133,19 +187,25 @@ class Processing:
                 self._settled += self._pipeline.finish()
                 self._write_settled()
             totals.reading_s = frames.seconds
-        totals.left_out = self._refused + frames.skipped
-        for problem in frames.problems:
-            self._say(f"note: {problem}")
+            totals.left_out = self._refused + frames.skipped
+            for problem in frames.problems:
+                self.note(problem)
         # Most cameras are not calibrated, and nobody misses directions then.
         wanted = self._arcs is not None or self._calibrated
         for why, count in totals.unlocated.items() if wanted else ():
-            self._say(f"note: {count} detections have no ra and dec: {why}{_missing(frames)}")
+            self.note(f"{count} detections have no ra and dec: {why}{_missing(frames)}")
+
+    def note(self, problem: str) -> None:
+        """Tell the user, now and in ``run.json``."""
+        self.totals.problems.append(problem)
+        self._say(f"note: {problem}")
 
     def _take(self, frame: Frame) -> None:
         totals = self.totals
         camera = self._camera_of(frame)
         self._add_attitudes(frame.attitudes)
-        self._write_settled()
+        with totals.timed("writing"):
+            self._write_settled()
         try:
             with totals.timed("other") as stages:
                 middle_ns = self._astrometry.middle_ns(frame.stamp_ns)
@@ -154,64 +214,68 @@ class Processing:
         except ImageError as error:
             self._refused += 1
             if self._refused == 1:
-                self._say(f"note: frame {frame.number} is left out, and others like it: {error}")
+                self.note(f"frame {frame.number} is left out, and others like it: {error}")
             return
         if result.reset and totals.frames:
-            self._say(f"note: frame {frame.number} starts afresh: {result.reset}")
-        self._frames[result.frame] = frame.number, camera
+            self.note(f"frame {frame.number} starts afresh: {result.reset}")
+        seen = _Seen(frame.number, frame.stamp_ns, frame.frame_id, camera, result)
+        self._seen[result.frame] = seen
         with totals.timed("writing"):
-            self._write(result)
-        totals.frames += 1
-        totals.reason = result.reason
+            self._writer.add_star_field(replace(result, frame=frame.number))
+            if self._live:
+                self._write(seen, result.detections)
+        self._settled += result.settled
+        totals.add_frame(result)
 
     def _camera_of(self, frame: Frame) -> Camera | None:
         camera, (height, width) = frame.camera, frame.image.shape
         if camera is not None and (camera.height, camera.width) != (height, width):
             if not self._misfit:
                 self._misfit = True
-                self._say(
-                    f"note: camera_info is for images of {camera.width}x{camera.height}, not of"
+                self.note(
+                    f"camera_info is for images of {camera.width}x{camera.height}, not of"
                     f" {width}x{height}: directions are unknown"
                 )
             return None
         if camera is not None and not self._calibrated:
             # The first calibration often comes with the first image, and after it.
             self._calibrated = True
-            self._frames = {key: (number, camera) for key, (number, _) in self._frames.items()}
+            self._seen = {key: replace(seen, camera=camera) for key, seen in self._seen.items()}
         return camera
 
     def _add_attitudes(self, attitudes: tuple[Attitude, ...]) -> None:
         for stamp_ns, rotation in attitudes:
             self._astrometry.add_attitude(stamp_ns, rotation)
 
-    def _write(self, result: FrameResult) -> None:
-        number, _ = self._frames[result.frame]
-        self._writer.add_star_field(replace(result, frame=number))
-        if self._live:
-            self._write_detections(result.stamp_ns, result.frame, result.detections)
-        self._settled += result.settled
-
     def _write_settled(self) -> None:
         settled, self._settled = self._settled, []
         for last in settled:
             # A frame in which an error ended all is in the history, but was not answered.
-            if last.frame in self._frames and not self._live:
-                self._write_detections(last.stamp_ns, last.frame, last.detections)
-            self._frames.pop(last.frame, None)
+            seen = self._seen.pop(last.frame, None)
+            if seen is not None and not self._live:
+                self._write(seen, last.detections)
 
-    def _write_detections(self, stamp_ns: int, frame: int, detections: Detections) -> None:
-        number, self._astrometry.camera = self._frames[frame]
+    def _write(self, seen: _Seen, detections: Detections) -> None:
+        stamp_ns, tracks = seen.result.stamp_ns, seen.result.tracks
+        self._astrometry.camera = seen.camera
         why = self._astrometry.locate(detections, stamp_ns)
         if why and len(detections):
             self.totals.unlocated[why] += len(detections)
-        self._writer.add_detections(stamp_ns, number, detections)
+        self._writer.add_detections(stamp_ns, seen.number, detections)
         if self._arcs is not None:
             self._arcs.add(stamp_ns, detections)
         self.totals.detections.update(detections["track_id"].tolist())
+        if self._bag is not None:
+            self._astrometry.locate(tracks, stamp_ns)
+            self._bag.add(
+                seen.stamp_ns, seen.frame_id, replace(seen.result, detections=detections)
+            )
 
 
 def _missing(frames: Recording) -> str:
-    """Say which topics for directions a recording does not have; empty if it has both."""
+    """Say what for directions a recording does not have; empty if it has all."""
+    if not frames.topic:
+        return "; no file's header has a celestial WCS" if frames.kind == "FITS" else ""
     topics = {
         "camera_info (sensor_msgs/CameraInfo)": frames.camera_info_topic,
         "attitude (geometry_msgs/QuaternionStamped)": frames.attitude_topic,

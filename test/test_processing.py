@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
+from command import ofsat
 from scipy.spatial.transform import Rotation
 
 from ofsat_ros.camera import Camera
-from ofsat_ros.cli import main
 from ofsat_ros.recordings import BagWriter
 from ofsat_ros.simulation import scenario, write_truth
 
@@ -51,8 +51,7 @@ def write_bag(
 
 
 def process(bag: Path, output: Path, *options: object) -> tuple[Result, list[dict]]:
-    command = ["process", str(bag), "-o", str(output), *map(str, options)]
-    done = CliRunner().invoke(main, command)
+    done = ofsat("process", bag, "-o", output, *options)
     assert done.exit_code == 0, done.output
     with (output / "detections.csv").open(encoding="utf-8") as file:
         return done, list(csv.DictReader(file))
@@ -65,6 +64,12 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def plain(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, list[dict]]:
+    """The recording, processed without any option."""
+    return process(bag, tmp_path_factory.mktemp("plain"))
+
+
 def gnomonic(x: float, y: float) -> np.ndarray:
     """Line of sight of a pixel of an ideal camera, by hand."""
     offset = np.array([x - (SIZE["width"] - 1) / 2, y - (SIZE["height"] - 1) / 2]) * SCALE_RAD
@@ -72,8 +77,8 @@ def gnomonic(x: float, y: float) -> np.ndarray:
     return vector / np.linalg.norm(vector)
 
 
-def test_each_detection_has_the_direction_of_its_pixel_at_mid_exposure(bag, tmp_path):
-    done, rows = process(bag, tmp_path)
+def test_each_detection_has_the_direction_of_its_pixel_at_mid_exposure(plain):
+    done, rows = plain
     assert done.stderr == ""
     assert len(rows) > 3 * FRAMES
     start_ns = min(int(row["stamp_ns"]) for row in rows)
@@ -86,10 +91,10 @@ def test_each_detection_has_the_direction_of_its_pixel_at_mid_exposure(bag, tmp_
         assert np.linalg.norm(sight - expected) < 5e-8
 
 
-def test_the_last_word_and_the_live_one_have_the_same_directions(bag, tmp_path):
+def test_the_last_word_and_the_live_one_have_the_same_directions(bag, plain, tmp_path):
     """Confirmed rows of both: the attitude is carried on live, and the camera turns evenly."""
-    _, late = process(bag, tmp_path / "late")
-    _, live = process(bag, tmp_path / "live", "--live")
+    _, late = plain
+    _, live = process(bag, tmp_path, "--live")
     known = {(row["frame"], row["track_id"]): row for row in late}
     shared = [row for row in live if row["confirmed"] == "1"]
     assert len(shared) > FRAMES
@@ -100,14 +105,13 @@ def test_the_last_word_and_the_live_one_have_the_same_directions(bag, tmp_path):
 
 
 @pytest.mark.parametrize(("reference", "shift"), [("start", -0.5), ("end", 0.5), ("middle", 0.0)])
-def test_stamps_are_turned_into_the_middle_of_the_exposure(bag, reference, shift, tmp_path):
+def test_stamps_are_turned_into_the_middle_of_the_exposure(plain, reference, shift, tmp_path):
     """A driver that stamps start or end of 1 s, whose clock is 0.25 s behind."""
     shifted = tmp_path / "bag"
     write_bag(shifted, shift_ns=round((shift - 0.25) * 1e9))
     options = ("--stamp-reference", reference, "--exposure-time-s", 1, "--stamp-offset-s", 0.25)
     _, rows = process(shifted, tmp_path / "shifted", *options)
-    _, plain = process(bag, tmp_path / "plain")
-    assert rows == plain
+    assert rows == plain[1]
 
 
 @pytest.mark.parametrize(
@@ -198,17 +202,3 @@ def test_tracking_data_without_directions_are_not_written_and_said(tmp_path):
     assert not (tmp_path / "out" / "tracks.tdm").exists()
     words = " ".join(done.stderr.split())
     assert "no tracking data is written: no track has ra and dec in 3 frames" in words
-
-
-def test_tracking_data_are_not_overwritten_unless_told(bag, tmp_path):
-    (tmp_path / "tracks.tdm").write_text("precious")
-    command = ["process", str(bag), "-o", str(tmp_path), "--tdm", "kvn"]
-    done = CliRunner().invoke(main, command)
-    assert done.exit_code == 1
-    assert "already holds tracks.tdm" in " ".join(done.stderr.split())
-    assert (tmp_path / "tracks.tdm").read_text() == "precious"
-    assert CliRunner().invoke(main, [*command, "--force"]).exit_code == 0
-    assert (tmp_path / "tracks.tdm").read_text().startswith("CCSDS_TDM_VERS")
-    # Without tracking data, none of another run's stays beside the new results.
-    assert CliRunner().invoke(main, [*command[:-2], "--force"]).exit_code == 0
-    assert not (tmp_path / "tracks.tdm").exists()

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ofsat_ros import results
 from ofsat_ros.detection import CANDIDATE, CONFIRMED, DETECTION_DTYPE
 from ofsat_ros.pipeline import FrameResult
 from ofsat_ros.results import ResultWriter, detection_lines, in_words
@@ -236,3 +237,37 @@ def test_a_second_file_that_cannot_be_written_leaves_none_open(tmp_path: Path):
 )
 def test_counts_tell_tracks_from_candidates(counts: dict[int, int], words: str):
     assert in_words(counts) == words
+
+
+def test_a_run_is_written_and_read(tmp_path):
+    run = {"recording": "/nächte/eins", "frames": 3, "topic": None, "problems": ["so"], "s": 0.1}
+    results.write_run(tmp_path, {"old": True})
+    results.write_run(tmp_path, run)
+    assert results.read_run(tmp_path) == run
+    assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
+
+
+def test_a_run_that_cannot_be_written_leaves_the_former_one(tmp_path):
+    results.write_run(tmp_path, {"frames": 3})
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        results.write_run(tmp_path, {"seconds": math.nan})
+    with pytest.raises(TypeError):
+        results.write_run(tmp_path, {"path": tmp_path})
+    assert results.read_run(tmp_path) == {"frames": 3}
+    assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "holds no run.json: give a folder that ofsat process has made"),
+        ('{"frames": 3', "run.json is damaged: .*; run ofsat process again"),
+        ("[1]", "run.json is damaged: it holds no object"),
+        ("\xff", "run.json is damaged"),
+    ],
+)
+def test_a_folder_without_a_whole_run_says_so(text, message, tmp_path):
+    if text is not None:
+        (tmp_path / "run.json").write_text(text, encoding="latin-1")
+    with pytest.raises(results.ResultError, match=message):
+        results.read_run(tmp_path)

@@ -31,8 +31,9 @@ from ofsat_ros.nodes.runtime import StartError, overridable_qos, parser_of, reli
 from ofsat_ros.parameters import RecorderParameters
 from ofsat_ros.recordings import BagWriter, RecordingError
 from ofsat_ros.results import DETECTION_COLUMNS, DETECTIONS, detection_lines, in_words
+from ofsat_ros.results.bag import BAG
 
-BAG, PICTURE = "results", "frame_{:06d}.png"
+PICTURE = "frame_{:06d}.png"
 HEARING = "hearing a detector"  # printed as soon as this is so
 
 # Results that may wait while a picture is written.

@@ -1,8 +1,6 @@
-"""Result files: the columns of ``detections.csv``, ``tracks.csv`` and ``star_field.csv``.
+"""The columns of ``detections.csv``, ``tracks.csv`` and ``star_field.csv``.
 
-Stands after the pipeline: the command ``ofsat process`` and the recorder node write through here,
-so that a file reads the same whoever made it.  Times are int ns UTC, angles in deg, unknown is
-``nan``.
+Times are int ns UTC, angles in deg, unknown is ``nan``.
 """
 
 from __future__ import annotations

@@ -1,0 +1,73 @@
+"""``run.json``: what a folder of results was made of, how, and what it did not tell.
+
+With it a folder explains itself: the report reads it, and opens the recording again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+RUN = "run.json"
+
+
+class ResultError(ValueError):
+    """A folder that holds no results; the message says what is missing."""
+
+
+def write_run(folder: str | Path, run: Mapping[str, Any]) -> None:
+    """Write ``run.json``; there is a whole one or none, whatever happens meanwhile.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Existing folder.
+    run : mapping of str to what JSON holds
+        ``version`` of this package; ``recording`` (absolute path), ``topic``,
+        ``camera_info_topic``, ``attitude_topic``, ``fps`` and ``exposure_s``, with which
+        ``open_recording`` gives the same frames again; ``preset``, and ``parameters`` as used, by
+        their names; ``live``; counts ``frames`` and ``left_out``; ``first_stamp_ns`` and
+        ``last_stamp_ns`` as in the tables, ``width`` and ``height`` (px), all null without a
+        frame; ``started_utc`` (ISO 8601) and ``seconds`` it took; ``profile``, seconds by stage;
+        ``problems``, the notes that the user was given; ``unlocated``, counts of detections
+        without direction by the reason; ``files`` made; ``stopped``, whether the run ended before
+        the recording did.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written.
+    """
+    path = Path(folder) / RUN
+    unfinished = path.with_name(f".{RUN}.part")
+    try:
+        text = json.dumps(dict(run), indent=2, ensure_ascii=False, allow_nan=False)
+        unfinished.write_text(text + "\n", encoding="utf-8")
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def read_run(folder: str | Path) -> dict[str, Any]:
+    """Return what `write_run` has written.
+
+    Raises
+    ------
+    ResultError
+        If there is no such file in the folder, or it is damaged.
+    OSError
+        If it cannot be read.
+    """
+    path = Path(folder) / RUN
+    if not path.is_file():
+        raise ResultError(f"{folder} holds no {RUN}: give a folder that ofsat process has made")
+    try:
+        run = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ResultError(f"{path} is damaged: {error}; run ofsat process again") from error
+    if not isinstance(run, dict):
+        raise ResultError(f"{path} is damaged: it holds no object; run ofsat process again")
+    return run
