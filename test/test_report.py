@@ -9,7 +9,7 @@ import pytest
 from ofsat_ros.detection import CANDIDATE, CONFIRMED, DETECTION_DTYPE
 from ofsat_ros.optical_flow import Flow
 from ofsat_ros.pipeline import FrameResult
-from ofsat_ros.report import annotate, summary
+from ofsat_ros.report import Tails, annotate, summary
 from ofsat_ros.star_field import StarFieldMotion
 from ofsat_ros.tracking import COASTING, TRACK_DTYPE
 
@@ -229,7 +229,7 @@ def test_the_caption_counts_the_rsos_or_gives_the_reason(monkeypatch: pytest.Mon
 
     monkeypatch.setattr(cv2, "putText", remember)
     annotate(dark(), result())
-    # Twice each: a dark rim, then the text.
+    # Several times each: a dark rim, then the text.
     assert set(written) == {
         "#12 10.77 px/s SNR 25",
         "frame 7: 1 RSO; 3 stars move (+6.00, -4.00) px",
@@ -258,6 +258,97 @@ def test_the_summary_tells_confirmed_rsos_from_candidates(statuses: list[int], w
     rows = np.zeros(len(statuses), DETECTION_DTYPE)
     rows["status"] = statuses
     assert summary(result(detections=rows)) == words
+
+
+def frame_with(*places: tuple[int, float, float], **values) -> FrameResult:
+    """A frame whose tracks (id, x, y) are confirmed."""
+    rows = tracks(*[CONFIRMED] * len(places))
+    for name, values_ in zip(("track_id", "x", "y"), zip(*places, strict=True), strict=True):
+        rows[name] = values_
+    return result(tracks=rows, **values)
+
+
+def test_tails_are_where_the_tracks_of_the_last_frame_were():
+    tails = Tails(frames=3)
+    assert tails.places() == {}
+    for number in range(5):
+        tails.add(frame_with((7, 10 * number, 50), *[(8, 300, number)] * (number > 3)))
+    places = tails.places()
+    assert places.keys() == {7, 8}
+    np.testing.assert_array_equal(places[7], [(20, 50), (30, 50), (40, 50)])
+    np.testing.assert_array_equal(places[8], [(300, 4)])
+    tails.add(frame_with((8, 301, 5)))
+    assert tails.places().keys() == {8}
+
+
+def test_a_reset_ends_all_tails():
+    tails = Tails()
+    tails.add(frame_with((1, 10, 10)))
+    tails.add(frame_with((1, 400, 10), reset="the clock was set back"))
+    np.testing.assert_array_equal(tails.places()[1], [(400, 10)])
+
+
+def test_a_tail_is_a_red_line_that_fades_and_a_coasting_one_is_yellow():
+    places = np.array([(100.0, 450.0), (200.0, 430.0), (300.0, 410.0), (400.0, 390.0)])
+    found = frame_with((12, 400, 390))
+    picture = annotate(dark(), found, tails={12: places})
+    bare = annotate(dark(), found)
+    drawn = (picture != bare).any(axis=2)
+    assert distance_to_segment(pixels(drawn), places[0], places[-1]).max() < 1.5
+    brightness = [
+        picture[y - 1 : y + 2, x, 2].max() for x, y in ((150, 440), (250, 420), (350, 400))
+    ]
+    assert brightness[0] < brightness[1] < brightness[2]
+    assert red(picture)[399:402, 349:352].any()
+    found.tracks["status"] = COASTING
+    picture = annotate(dark(), found, tails={12: places})
+    assert yellow(picture)[399:402, 349:352].any()
+
+
+def test_a_track_of_one_place_has_no_tail():
+    found = frame_with((12, 400, 390))
+    picture = annotate(dark(), found, tails={12: np.array([(400.0, 390.0)])})
+    np.testing.assert_array_equal(picture, annotate(dark(), found))
+
+
+def test_the_footer_is_bright_text_at_the_bottom():
+    picture = annotate(dark(), result(found=False), footer="9.8 Hz  0 dropped")
+    assert np.count_nonzero(white(picture[-22:])) > 60
+    assert not white(picture[30:-24]).any()
+    assert not white(annotate(dark(), result(found=False))[-22:]).any()
+
+
+def test_a_large_picture_has_thick_lines_and_large_letters():
+    """A screen shows every fourth pixel of it."""
+    shape = (4000, 4100)
+    found = result(shape)
+    picture = annotate(dark(shape), found, scale=1.0)
+    assert picture.shape == (*shape, 3)
+    x, y = RSO.astype(int)
+    # The box: 32 px to each side, its lines 4 px wide.
+    across = red(picture)[y - 32 - 6 : y - 32 + 7, x]
+    assert across.sum() == pytest.approx(4, abs=1.5)
+    caption = pixels(white(picture[:100]))
+    height = caption[:, 1].max() - caption[:, 1].min()
+    small = pixels(white(annotate(dark(), result())[:25]))
+    assert height == pytest.approx(4 * (small[:, 1].max() - small[:, 1].min()), rel=0.25)
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+def test_faint_stars_show_on_a_bright_slope(dtype):
+    """Moonlight of 200 sigma across the image, and a vignette, leave the sky dark and even."""
+    random = np.random.default_rng(1)
+    x, y = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    slope = 0.6 * x - ((x - 320) ** 2 + (y - 250) ** 2) / 2000
+    image = random.normal(1000, 6, (HEIGHT, WIDTH)) + slope
+    for column in (50, 600):
+        image[200:203, column - 1 : column + 2] += 40
+    plain = FrameResult(1, 0, image.shape, background=float(np.median(image)), noise=2.0)
+    gray = annotate(np.rint(image).astype(dtype), plain)[..., 0]
+    for column in (50, 600):
+        around = gray[150:250, column - 30 : column + 30]
+        assert 15 <= np.median(around) < 45
+        assert gray[201, column] > np.median(around) + 50
 
 
 def test_without_a_star_field_the_rso_is_still_drawn():
