@@ -12,7 +12,7 @@ import cv2
 
 from ofsat_ros.parameters import markdown_table
 from ofsat_ros.pipeline import Pipeline
-from ofsat_ros.report import annotate
+from ofsat_ros.report import Tails, annotate
 from ofsat_ros.simulation import scenario
 
 DOCS = Path(__file__).parent
@@ -23,11 +23,12 @@ PICTURES = (("geo.png", "geo", 12, 4), ("sidereal.png", "sidereal", 40, 1))
 
 def picture(name: str, number: int, seed: int) -> cv2.typing.MatLike:
     """Return the annotated picture of one frame of a scenario."""
-    sky, pipeline = scenario(name, seed), Pipeline()
+    sky, pipeline, tails = scenario(name, seed), Pipeline(), Tails()
     for frame in sky:
         result = pipeline.process(frame.image, frame.stamp_ns)
+        tails.add(result)
         if frame.frame == number:
-            return annotate(frame.image, result, scale=1.0)
+            return annotate(frame.image, result, scale=1.0, tails=tails.places())
     raise ValueError(f"{name} has no frame {number}")
 
 

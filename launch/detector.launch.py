@@ -3,6 +3,7 @@
 For example::
 
     ros2 launch ofsat_ros detector.launch.py image:=/camera/image_raw params_file:=my.yaml
+    ros2 launch ofsat_ros detector.launch.py image:=/camera/image_raw rviz:=true
 
 Sets the Fast DDS profile for large images unless the environment already names one; whoever sends
 the images needs it too.
@@ -18,9 +19,9 @@ from launch_ros.actions import Node
 
 from ofsat_ros.parameters import preset_names
 
-PROFILE = Path(
-    get_package_share_directory("ofsat_ros"), "config", "fastdds_large_images.xml"
-).as_posix()
+CONFIG = Path(get_package_share_directory("ofsat_ros"), "config")
+PROFILE = (CONFIG / "fastdds_large_images.xml").as_posix()
+VIEW = (CONFIG / "ofsat.rviz").as_posix()
 
 ARGUMENTS = [
     DeclareLaunchArgument(
@@ -56,11 +57,20 @@ ARGUMENTS = [
     DeclareLaunchArgument(
         "params_file", default_value="", description="YAML file of parameters; empty: none"
     ),
+    DeclareLaunchArgument(
+        "rviz",
+        default_value="false",
+        choices=["true", "false"],
+        description="true: show image and markers in RViz, which must be installed: rviz2",
+    ),
 ]
 
 
 def detector(context: LaunchContext) -> list[Node]:
-    """Return the node; an argument that is not given leaves the parameter as it would be."""
+    """Return the node; an argument that is not given leaves the parameter as it would be.
+
+    And RViz, if it is wanted.
+    """
     given = {
         argument.name: LaunchConfiguration(argument.name).perform(context)
         for argument in ARGUMENTS
@@ -81,8 +91,23 @@ def detector(context: LaunchContext) -> list[Node]:
             output="screen",
             parameters=[*files, parameters],
             remappings=remappings,
-        )
+        ),
+        *([rviz(given["namespace"])] if given["rviz"] == "true" else []),
     ]
+
+
+def rviz(namespace: str) -> Node:
+    """Return RViz, looking at what the detector in a namespace publishes."""
+    topics = ("image_annotated", "flow_markers")
+    return Node(
+        package="rviz2",
+        executable="rviz2",
+        name="rviz",
+        namespace=namespace,
+        arguments=["-d", VIEW],
+        # The view names topics without a namespace.
+        remappings=[(f"/{topic}", topic) for topic in topics],
+    )
 
 
 def generate_launch_description() -> LaunchDescription:

@@ -3,6 +3,7 @@
 The wheels of ROS lack `launch`, so the files run with stand-ins that record what they ask for.
 """
 
+import re
 import runpy
 import sys
 from pathlib import Path
@@ -120,6 +121,20 @@ def test_detector_takes_its_arguments(launch: Any):
         ("image", "/cam/image_raw"),
         ("image/compressed", "/cam/image_raw"),
     ]
+
+
+def test_rviz_looks_at_the_detectors_topics_only_when_it_is_wanted(launch: Any):
+    asked = launch("detector.launch.py", namespace="east", rviz="true")
+    detector, rviz = of_kind("Node", asked)
+    assert detector.kwargs["executable"] == "detector"
+    assert (rviz.kwargs["package"], rviz.kwargs["executable"]) == ("rviz2", "rviz2")
+    assert rviz.kwargs["namespace"] == "east"
+    flag, view = rviz.kwargs["arguments"]
+    assert (flag, view) == ("-d", "/share/ofsat_ros/config/ofsat.rviz")
+    file = ROOT / "ofsat_ros" / "data" / Path(view).name
+    named = re.findall(r"Value: (/\w+)", file.read_text())
+    # Each topic of the view, within the namespace.
+    assert rviz.kwargs["remappings"] == [(topic, topic.strip("/")) for topic in named]
 
 
 def test_detector_offers_the_presets_there_are(launch: Any):

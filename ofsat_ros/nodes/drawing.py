@@ -11,7 +11,9 @@ from __future__ import annotations
 import threading
 import time
 import traceback
+from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 import numpy as np
 from rclpy.node import Node
@@ -30,11 +32,12 @@ _REST_S = 0.2
 
 @dataclass(frozen=True)
 class _Scene:
-    """What is to be drawn: an image and its result."""
+    """What is to be drawn: an image, its result, and where its tracks were before."""
 
     image: np.ndarray
     result: FrameResult
     scale: float
+    tails: Mapping[int, np.ndarray]
 
 
 class Drawing:
@@ -66,13 +69,17 @@ class Drawing:
         # One in work and one that waits: more would only take memory.
         self._inbox = Inbox(1, None if every_frame else 0.0, limit_bytes=0)
         self._shown: tuple[Header, float] | None = None  # markers that are to be seen, since when
+        self._tails = report.Tails()
         self._thread = threading.Thread(target=self._work, name="drawing", daemon=True)
         self._thread.start()
 
     def show(self, header: Header, image: np.ndarray, result: FrameResult, scale: float) -> None:
         """Have a result drawn, if anybody looks."""
+        # Always: who begins to look is to see where the tracks come from.
+        self._tails.add(result)
         if self._markers.get_subscription_count() or self._pictures.get_subscription_count():
-            self._inbox.put((header, _Scene(image, result, scale)), image.nbytes)
+            scene = _Scene(image, result, scale, self._tails.places())
+            self._inbox.put((header, scene), image.nbytes)
 
     def clear(self, header: Header) -> None:
         """Have the markers deleted after a frame that gave nothing."""
@@ -116,5 +123,17 @@ class Drawing:
             self._markers.publish(array)
             self._shown = (header, time.monotonic())
         if self._pictures.get_subscription_count():
-            picture = report.annotate(scene.image, scene.result, scale=scene.scale)
+            picture = report.annotate(
+                scene.image,
+                scene.result,
+                scale=scene.scale,
+                tails=scene.tails,
+                footer=f"{_utc(header)}  {self._health.pace()}",
+            )
             self._pictures.publish(messages.image_message(header, picture))
+
+
+def _utc(header: Header) -> str:
+    """The time of an image, to be read by people."""
+    when = datetime.fromtimestamp(messages.stamp_ns(header.stamp) / 1e9, UTC)
+    return f"{when:%Y-%m-%d %H:%M:%S}.{when.microsecond // 100_000} UTC"

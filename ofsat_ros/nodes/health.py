@@ -204,6 +204,15 @@ class Health:
             return "waiting for images"
         return report.summary(result)
 
+    def pace(self) -> str:
+        """Return in words how fast frames are answered, and how many were not."""
+        with self._lock:
+            rate_hz, latency_s = self._rate_hz(), self._latency_s
+        dropped, lost = self._counts["dropped"], self._counts["lost"]
+        return (
+            f"{rate_hz:.1f} Hz  latency {1e3 * latency_s:.0f} ms  {dropped} dropped  {lost} lost"
+        )
+
     def values(self) -> dict[str, Any]:
         """Return names and values for ``/diagnostics``: counts, and what the last frame gave."""
         values: dict[str, Any] = {}
