@@ -13,54 +13,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from command import fails, subprocess_ofsat, succeeds
 
 import ofsat_ros
 from ofsat_ros import evaluation
-from ofsat_ros.cli import main
 from ofsat_ros.parameters import Parameters, preset_names
 from ofsat_ros.pipeline import Pipeline
-from ofsat_ros.recordings import IMAGE, BagWriter, open_recording
-from ofsat_ros.results import DETECTION_COLUMNS, STAR_FIELD_COLUMNS
+from ofsat_ros.recordings import IMAGE, Bag, BagWriter, open_recording
+from ofsat_ros.results import DETECTION_COLUMNS, STAR_FIELD_COLUMNS, read_run
 from ofsat_ros.simulation import SCENARIOS, TRUTH_DTYPE, scenario
 
 TOPIC = "/camera/image_raw"
 START = 1_767_225_600_000_000_000
-
-
-def ofsat(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(a) for a in arguments])
-
-
-def succeeds(*arguments: object) -> Result:
-    done = ofsat(*arguments)
-    assert done.exit_code == 0, done.output
-    return done
-
-
-def fails(code: int, *arguments: object) -> str:
-    """Run what must fail, without a traceback; return what it says, on one line."""
-    done = ofsat(*arguments)
-    assert isinstance(done.exception, SystemExit), done.exception
-    assert done.exit_code == code, done.output
-    assert done.stdout == ""
-    return " ".join(done.stderr.split())
-
-
-def subprocess_ofsat(*arguments: object, **options) -> subprocess.Popen:
-    environment = {
-        **os.environ,
-        "PYTHONPATH": str(Path(ofsat_ros.__file__).parent.parent),
-        "COLUMNS": "200",
-    }
-    return subprocess.Popen(
-        [sys.executable, "-W", "error", "-m", "ofsat_ros.cli", *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment,
-        **options,
-    )
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -270,12 +234,12 @@ def test_process_takes_a_preset_and_changes(preset: str, small: Path, tmp_path: 
 
 
 def test_process_has_an_option_for_every_parameter():
-    done = succeeds("process", "--help")
+    done = succeeds("process", "--help-all")
     words = " ".join(done.stdout.split())
     for about in Parameters.describe():
         assert f"--{about.name.replace('_', '-')} " in words
         allowed = f"{about.allowed} {about.unit}".strip()
-        assert f"[{about.stage}; {allowed}]" in words
+        assert f"[{about.stage}; {allowed}; default {about.default}]" in words
 
 
 @pytest.mark.parametrize("about", [*Parameters.describe()], ids=lambda about: about.name)
@@ -358,7 +322,7 @@ def test_an_output_that_cannot_be_made(small: Path):
 def test_a_file_that_cannot_be_written(small: Path, tmp_path: Path):
     (tmp_path / "star_field.csv").mkdir()
     said = fails(1, "process", small, "-o", tmp_path, "--force")
-    assert said == f"ofsat: {tmp_path}/star_field.csv: Is a directory"
+    assert said.startswith(f"ofsat: {tmp_path}/star_field.csv is not replaced, since it is no bag")
 
 
 def test_a_disk_that_is_full_ends_with_a_reason(small: Path, tmp_path: Path, monkeypatch):
@@ -521,7 +485,7 @@ def test_an_empty_scenario_has_next_to_no_false_alarm(tmp_path: Path):
 
 
 def test_the_program_keeps_its_two_streams_apart(small: Path, tmp_path: Path):
-    done = subprocess_ofsat("process", small, "-o", tmp_path / "out")
+    done = subprocess_ofsat("process", small, "-o", tmp_path / "out", "--no-report")
     out, err = done.communicate(timeout=60)
     assert done.returncode == 0, err
     assert re.fullmatch(r"\d+ RSO detections of \d+ tracks in 6 frames; .*\n", out)
@@ -534,7 +498,8 @@ def test_the_progress_bar_is_on_standard_error(small: Path, tmp_path: Path):
     """A terminal on standard error, a pipe on standard output."""
     master, slave = os.openpty()
     termios.tcsetwinsize(slave, (24, 100))
-    command = [sys.executable, "-m", "ofsat_ros.cli", "process", small, "-o", tmp_path / "out"]
+    command = [sys.executable, "-m", "ofsat_ros.cli", "process", small, "--no-report"]
+    command += ["-o", tmp_path / "out"]
     environment = {**os.environ, "PYTHONPATH": str(Path(ofsat_ros.__file__).parent.parent)}
     done = subprocess.run(
         command, stdout=subprocess.PIPE, stderr=slave, env=environment, timeout=60, text=True
@@ -544,7 +509,8 @@ def test_the_progress_bar_is_on_standard_error(small: Path, tmp_path: Path):
     os.close(master)
     assert done.returncode == 0
     assert re.fullmatch(r"\d+ RSO detections of \d+ tracks in 6 frames; .*\n", done.stdout)
-    assert re.search(r"6/6 .* frames", shown)
+    # Time taken, time left, rate.
+    assert re.search(r"6/6 \[\d\d:\d\d<\d\d:\d\d, +[\d.]+ ?(frames/s|s/ frames)\]", shown)
 
 
 def wait_for_lines(path: Path, count: int, program: subprocess.Popen) -> None:
@@ -559,7 +525,7 @@ def test_an_interruption_leaves_whole_files(tmp_path: Path):
     # Hundreds of frames, of which few are done when the signal comes.
     image = moving(2, 512)
     write(tmp_path / "bag", [image[i % 2] for i in range(300)])
-    program = subprocess_ofsat("process", tmp_path / "bag", "-o", tmp_path / "out")
+    program = subprocess_ofsat("process", tmp_path / "bag", "-o", tmp_path / "out", "--bag")
     wait_for_lines(tmp_path / "out/star_field.csv", 4, program)
     program.send_signal(signal.SIGINT)
     out, err = program.communicate(timeout=60)
@@ -576,6 +542,15 @@ def test_an_interruption_leaves_whole_files(tmp_path: Path):
         assert text.endswith("\n")
         lines = list(csv.reader(text.splitlines()))
         assert {len(line) for line in lines} == {len(columns)}
+    run = read_run(tmp_path / "out")
+    assert (run["stopped"], run["frames"]) == (True, int(said[2]))
+    with Bag(tmp_path / "out/results") as bag:
+        counts = [about.count for about in bag.topics.values()]
+        assert len(list(bag.messages(list(bag.topics)))) == sum(counts)
+        assert bag.problems == []
+    # The signal may also come between two of a frame's messages.
+    assert len(counts) == 4
+    assert {len(rows) - count for count in counts} <= {0, 1}
 
 
 def test_an_interruption_leaves_a_whole_bag(tmp_path: Path):

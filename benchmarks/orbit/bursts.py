@@ -15,7 +15,7 @@ from sgp4.api import Satrec
 
 from benchmarks.orbit.geometry import NS, Array, Geometry, unit
 from ofsat_ros.cli import main as ofsat
-from ofsat_ros.cli.simulate import ATTITUDE_TOPIC, CAMERA_INFO_TOPIC, FRAME_ID, IMAGE_TOPIC
+from ofsat_ros.cli.camera_bag import ATTITUDE_TOPIC, CAMERA_INFO_TOPIC, FRAME_ID, IMAGE_TOPIC
 from ofsat_ros.recordings import BagWriter
 from ofsat_ros.simulation import Fixed, Motion, SimulatorSettings, SphereSimulator, Target
 from ofsat_ros.site import Site

@@ -17,7 +17,7 @@ from ofsat_ros.evaluation import (
 )
 
 
-@click.command("evaluate")
+@click.command("evaluate", epilog="Example: ofsat evaluate my_results my_sky.truth.csv --list")
 @click.argument("results", type=click.Path(path_type=Path))
 @click.argument("truth", type=click.Path(dir_okay=False, path_type=Path))
 @click.option(

@@ -9,17 +9,16 @@ from typing import Any
 import click
 from tqdm import tqdm
 
+from ofsat_ros.cli.camera_bag import CameraBag, bag_options
 from ofsat_ros.cli.terminal import fail, say
 from ofsat_ros.parameters import ParameterError
-from ofsat_ros.recordings import BagWriter, RecordingError
+from ofsat_ros.recordings import RecordingError
 from ofsat_ros.simulation import SCENARIOS, scenario, write_truth
 
-IMAGE_TOPIC = "/camera/image_raw"
-CAMERA_INFO_TOPIC, ATTITUDE_TOPIC = "/camera/camera_info", "/camera/attitude"
-FRAME_ID = "camera_optical_frame"
 
-
-@click.command("simulate")
+@click.command(
+    "simulate", epilog="Example: ofsat simulate -o my_sky --scenario geo --seed 7 --frames 60"
+)
 @click.option(
     "-o",
     "--output",
@@ -27,16 +26,22 @@ FRAME_ID = "camera_optical_frame"
     type=click.Path(path_type=Path),
     help="bag to make: a new folder; its truth is written beside it as OUTPUT.truth.csv",
 )
-@click.option("--scenario", "name", default="sidereal", type=click.Choice(list(SCENARIOS)))
+@click.option(
+    "--scenario",
+    "name",
+    default="sidereal",
+    show_default=True,
+    type=click.Choice(list(SCENARIOS)),
+    metavar="NAME",
+    help=", ".join(SCENARIOS),
+)
 @click.option("--seed", default=1, show_default=True, help="seed of everything that is random")
 @click.option("--frames", type=int, help="number of frames, if not the scenario's")
 @click.option(
     "--size", type=(int, int), metavar="WIDTH HEIGHT", help="size in px, if not the scenario's"
 )
 @click.option("--bit-depth", type=click.IntRange(8, 16), help="bits per pixel")
-@click.option("--storage", default="mcap", type=click.Choice(["mcap", "sqlite3"]))
-@click.option("--compressed", is_flag=True, help="write PNG CompressedImage messages")
-@click.option("--force", is_flag=True, help="replace a bag of that name")
+@bag_options
 def command(
     output: Path,
     name: str,
@@ -57,15 +62,12 @@ def command(
     except ParameterError as error:
         raise click.UsageError(str(error)) from error
     truth = Path(f"{output}.truth.csv")
-    topic = IMAGE_TOPIC + ("/compressed" if compressed else "")
     rows = []
     try:
-        with BagWriter(output, storage=storage, compression="none", force=force) as bag:
+        with CameraBag(output, storage, compressed, force) as bag:
             for frame in tqdm(sky, total=len(sky), unit=" frames", disable=None):
-                stamp_ns = frame.stamp_ns
-                bag.write_camera_info(CAMERA_INFO_TOPIC, sky.camera, stamp_ns, FRAME_ID)
-                bag.write_attitude(ATTITUDE_TOPIC, frame.attitude, stamp_ns, FRAME_ID)
-                bag.write_image(topic, frame.image, stamp_ns, FRAME_ID, compressed=compressed)
+                bag.add_attitudes(((frame.stamp_ns, frame.attitude),))
+                bag.add_frame(frame.image, frame.stamp_ns, sky.camera)
                 rows.append(frame.truth)
         write_truth(truth, rows)
     except (RecordingError, OSError) as error:
@@ -74,4 +76,4 @@ def command(
         write_truth(truth, rows)
         say(f"stopped; {len(rows)} frames are in {output}, their truth in {truth}")
         sys.exit(130)
-    click.echo(f"{len(rows)} frames on {topic} are in {output}, their truth in {truth}")
+    click.echo(f"{len(rows)} frames on {bag.image_topic} are in {output}, their truth in {truth}")

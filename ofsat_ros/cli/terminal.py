@@ -1,9 +1,11 @@
-"""What the commands share: words to the user, options from the tables, folders to write to."""
+"""What the commands share: words to the user, options, folders to write to."""
 
 from __future__ import annotations
 
 import sys
+import traceback
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -11,23 +13,55 @@ import click
 from tqdm import tqdm
 
 from ofsat_ros.parameters import Description, Table
-from ofsat_ros.recordings import RecordingError
+from ofsat_ros.recordings import RecordingError, remove_bag
 
 _Command = Callable[..., None]
+_ALL = f"{__name__}.all"
+
+
+class _SeldomOption(click.Option):
+    """An option that ``--help`` leaves out, and ``--help-all`` and completion don't."""
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        return super().get_help_record(ctx) if ctx.meta.get(_ALL) else None
+
+
+# An option for a command with `help_all`, whose ``--help`` is to fit a screen.
+seldom_option = partial(click.option, cls=_SeldomOption)
+
+
+def help_all(command: _Command) -> _Command:
+    """Add ``--help-all`` to a command with seldom options."""
+    return click.option(
+        "--help-all",
+        is_flag=True,
+        is_eager=True,
+        expose_value=False,
+        callback=_show_all,
+        help="show all options, those that are seldom needed too",
+    )(command)
+
+
+def _show_all(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
+    if wanted and not ctx.resilient_parsing:
+        ctx.meta[_ALL] = True
+        click.echo(ctx.get_help())
+        ctx.exit()
 
 
 def parameter_options(*tables: type[Table]) -> Callable[[_Command], _Command]:
-    """Add an option for each parameter of the tables to a command."""
+    """Add a seldom option for each parameter of the tables to a command."""
     abouts = [about for table in tables for about in table.describe()]
 
     def add(command: _Command) -> _Command:
         for about in reversed(abouts):
             allowed = f"{about.allowed} {about.unit}".strip()
-            option = click.option(
+            default = about.default if about.default != "" else "none"
+            option = seldom_option(
                 f"--{about.name.replace('_', '-')}",
                 about.name,
                 type=_option_type(about),
-                help=f"{about.meaning} [{about.stage}; {allowed}]",
+                help=f"{about.meaning} [{about.stage}; {allowed}; default {default}]",
             )
             command = option(command)
         return command
@@ -37,6 +71,28 @@ def parameter_options(*tables: type[Table]) -> Callable[[_Command], _Command]:
 
 def _option_type(about: Description) -> Any:
     return click.Choice(about.choices) if about.choices else type(about.default)
+
+
+def recording_options(command: _Command) -> _Command:
+    """Add the options of `open_recording`, each by the name of its argument."""
+    positive = click.FloatRange(min=0, min_open=True)
+    for add in (
+        click.option(
+            "--exposure",
+            "exposure_s",
+            type=positive,
+            metavar="SECONDS",
+            help="length of an exposure, where no header tells it",
+        ),
+        click.option(
+            "--fps", type=positive, metavar="RATE", help="frames per second, where none have times"
+        ),
+        seldom_option("--attitude-topic", help="topic of the attitude, if there are several"),
+        seldom_option("--camera-info-topic", help="topic of the calibration, if several"),
+        click.option("--topic", help="image topic, if the recording holds several"),
+    ):
+        command = add(command)
+    return command
 
 
 def of_table(table: type[Table], given: dict[str, Any]) -> dict[str, Any]:
@@ -55,16 +111,24 @@ def claim(folder: Path, files: list[str], force: bool) -> None:
             " replace them"
         )
     # What is not made this time must not stay beside what is.
-    for name in old:
-        (folder / name).unlink()
+    for path in (folder / name for name in old):
+        remove_bag(path) if path.is_dir() else path.unlink()
 
 
 def fail(error: Exception | str) -> NoReturn:
     """End the command with exit code 1 and a line that says why."""
+    if isinstance(error, Exception) and debugging():
+        traceback.print_exception(error)
     if isinstance(error, OSError) and error.strerror:
         error = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     say(f"ofsat: {error}")
     sys.exit(1)
+
+
+def debugging() -> bool:
+    """Whether the user wants tracebacks (``ofsat --debug``)."""
+    context = click.get_current_context(silent=True)
+    return context is not None and bool(context.find_root().params.get("debug"))
 
 
 def say(line: str) -> None:

@@ -1,0 +1,74 @@
+"""The bag of one camera that commands write: its images, and what gives their directions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+import numpy as np
+
+from ofsat_ros.camera import Camera
+from ofsat_ros.recordings import Attitude, BagWriter
+
+IMAGE_TOPIC = "/camera/image_raw"
+CAMERA_INFO_TOPIC, ATTITUDE_TOPIC = "/camera/camera_info", "/camera/attitude"
+FRAME_ID = "camera_optical_frame"
+
+
+class CameraBag(BagWriter):
+    """A bag of one camera's frames; a context manager.
+
+    Parameters
+    ----------
+    path, storage, force
+        As in `BagWriter`.
+    compressed : bool
+        Write the images as PNG, in CompressedImage messages.
+
+    Attributes
+    ----------
+    image_topic : str
+    frames : int
+        Images written so far.
+
+    Raises
+    ------
+    RecordingError
+        As `BagWriter`; so do the methods.
+    """
+
+    def __init__(self, path: Path, storage: str, compressed: bool, force: bool) -> None:
+        super().__init__(path, storage=storage, compression="none", force=force)
+        self._compressed = compressed
+        self.image_topic = f"{IMAGE_TOPIC}/compressed" if compressed else IMAGE_TOPIC
+        self.frames = 0
+
+    def add_attitudes(self, attitudes: tuple[Attitude, ...]) -> None:
+        """Write attitudes, each at its own stamp."""
+        for stamp_ns, attitude in attitudes:
+            self.write_attitude(ATTITUDE_TOPIC, attitude, stamp_ns, FRAME_ID)
+
+    def add_frame(self, image: np.ndarray, stamp_ns: int, camera: Camera | None) -> None:
+        """Write an image, and before it the calibration if there is one."""
+        if camera is not None:
+            self.write_camera_info(CAMERA_INFO_TOPIC, camera, stamp_ns, FRAME_ID)
+        self.write_image(self.image_topic, image, stamp_ns, FRAME_ID, compressed=self._compressed)
+        self.frames += 1
+
+
+def bag_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Add ``--storage``, ``--compressed`` and ``--force`` to a command."""
+    for option in (
+        click.option("--force", is_flag=True, help="replace a bag of that name"),
+        click.option("--compressed", is_flag=True, help="write PNG CompressedImage messages"),
+        click.option(
+            "--storage",
+            default="mcap",
+            type=click.Choice(["mcap", "sqlite3"]),
+            show_default=True,
+            help="what holds the bag's messages",
+        ),
+    ):
+        command = option(command)
+    return command
