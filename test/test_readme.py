@@ -3,28 +3,39 @@
 A command of a kind that another test runs, or CI itself, is only checked for what it names.
 """
 
-import os
+import ast
 import re
 import runpy
 import shlex
 import signal
-import subprocess
-import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from command import succeeds
+from night import write_night
 from ros_graph import Process
 
 from ofsat_ros.camera import to_radec
 from ofsat_ros.detection import DETECTION_DTYPE
 from ofsat_ros.parameters import Parameters
 from ofsat_ros.results import DETECTION_COLUMNS, STAR_FIELD_COLUMNS, TRACK_COLUMNS
+from ofsat_ros.simulation import scenario
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 INTEGRATION = (ROOT / "docs" / "integration.md").read_text()
+TROUBLESHOOTING = (ROOT / "docs" / "troubleshooting.md").read_text()
+# Pages with commands for users; the README's are those of `.venv`.
+PAGES = (
+    "README.md",
+    *(
+        f"docs/{name}.md"
+        for name in ("tutorial", "optics", "troubleshooting", "commands", "integration")
+    ),
+)
 # Ready when it has said this.
 READY = {
     "detector": "waiting for images on",
@@ -35,7 +46,11 @@ READY = {
     "tdm_writer": "writing the tracks of",
 }
 # What only a machine with ROS from apt can do, and what the tests of colcon and launch do.
-ELSEWHERE = ("rosdep install", "pip install", "colcon build", "source install", "ros2 launch")
+ELSEWHERE = (
+    *("rosdep install", "pip install", "colcon build", "source install", "ros2 launch"),
+    *("python3 -m venv", "~/ofsat/bin/pip install", "export "),
+)
+OFSAT = (".venv/bin/ofsat ", "ofsat ")
 
 
 def commands(text: str) -> list[str]:
@@ -63,9 +78,11 @@ def installed(text: str) -> str:
     return text.replace("src/ofsat_ros/", f"{ROOT}/")
 
 
-def test_every_command_is_of_a_kind_that_is_run() -> None:
-    kinds = ("make ", ".venv/bin/ofsat ", "ros2 run ofsat_ros ", "ros2 param set", *ELSEWHERE)
-    assert [line for line in commands(README) if not line.startswith(kinds)] == []
+@pytest.mark.parametrize("page", PAGES)
+def test_every_command_is_of_a_kind_that_is_run(page: str) -> None:
+    kinds = (*OFSAT, "make ", "ros2 run ofsat_ros ", "ros2 param set", *ELSEWHERE)
+    lines = commands((ROOT / page).read_text())
+    assert [line for line in lines if not line.startswith(kinds)] == []
 
 
 def test_make_targets_are_what_ci_runs() -> None:
@@ -73,23 +90,51 @@ def test_make_targets_are_what_ci_runs() -> None:
     assert [line for line in starting("make ") if line not in ci] == []
 
 
-def test_ofsat_commands_run(tmp_path: Path) -> None:
+def test_extras_to_install_are_those_of_setup() -> None:
+    extras = set(re.findall(r'^        "(\w+)": ', (ROOT / "setup.py").read_text(), re.M))
+    for page in PAGES:
+        for named in re.findall(r"'\.\[([\w,]+)\]'", (ROOT / page).read_text()):
+            assert set(named.split(",")) <= extras
+
+
+# What a page's commands leave behind, and what stands in it at least.
+MADE = {
+    "README.md": {
+        "night1/detections.csv": "track_id",
+        "my_sky.truth.csv": "snr",
+        "night1_angles/tracks.tdm": "ANGLE_1",
+        "night1_angles/tracks.iod": "9999",
+    },
+    "docs/tutorial.md": {
+        "results/report.html": "<html",
+        "results/tracks.csv": "track_id",
+        "results/last_night.mp4": "",
+        "results_angles/tracks.tdm": "ANGLE_2",
+        "results_angles/tracks.iod": "9999",
+        "results_bag/results/metadata.yaml": "rso_detections",
+    },
+    "docs/optics.md": {"my_optics.yaml": "ros__parameters"},
+    "docs/troubleshooting.md": {},
+    "docs/commands.md": {"survey_bag/metadata.yaml": "/camera/image_raw"},
+    "docs/integration.md": {"out/tracks.tdm": "ANGLE_1"},
+}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_ofsat_commands_run(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "bags").symlink_to(ROOT / "bags")
-    for line in (*starting(".venv/bin/ofsat "), *starting("ofsat ", INTEGRATION)):
-        arguments = shlex.split(line)[1:]
-        done = subprocess.run(
-            [sys.executable, "-m", "ofsat_ros.cli", *arguments],
-            cwd=tmp_path,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-            capture_output=True,
-            text=True,
-            timeout=100,
-        )
-        assert done.returncode == 0, (line, done.stderr)
-    assert (tmp_path / "night1" / "detections.csv").stat().st_size > 1000
-    assert (tmp_path / "my_sky.truth.csv").exists()
-    for name in ("night1_angles/tracks.tdm", "night1_angles/tracks.iod", "out/tracks.tdm"):
-        assert (tmp_path / name).stat().st_size > 1000
+    if page == "docs/tutorial.md":
+        sky = scenario("survey", 1, width=256, height=208, frames=12, exposure_s=0.8)
+        write_night(tmp_path / "last_night", sky, exposure_s=0.8)
+    lines = [line for line in commands((ROOT / page).read_text()) if line.startswith(OFSAT)]
+    for line in lines:
+        succeeds(*shlex.split(line)[1:])
+    assert len(lines) >= 1
+    for file, content in MADE[page].items():
+        made = (tmp_path / file).read_bytes()
+        assert len(made) > 50
+        assert content.encode() in made
 
 
 @pytest.mark.parametrize(
@@ -182,9 +227,41 @@ def test_pictures_are_the_present_ones() -> None:
         assert different < 0.01, f"{file}: run python docs/generate.py"
 
 
+def texts(tree: ast.AST) -> Iterator[str]:
+    """Every string of some code, with a zero byte for each value that is put in."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            parts = [n.value if isinstance(n, ast.Constant) else "\0" for n in node.values]
+            yield "".join(str(part) for part in parts)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.value
+
+
+def test_messages_that_are_explained_are_the_programs() -> None:
+    said = {
+        text
+        for path in (ROOT / "ofsat_ros").rglob("*.py")
+        for text in texts(ast.parse(path.read_text()))
+    }
+    rows = re.findall(r"^\| `(.+?)` \|", TROUBLESHOOTING, re.M)
+    assert len(rows) > 30
+    for row in rows:
+        pieces = [re.escape(piece.strip()) for piece in row.split("...") if piece.strip()]
+        pattern = re.compile(r"[\s\S]*".join(pieces))
+        assert any(pattern.search(text) for text in said), f"no message says {row!r}"
+
+
+def anchors(text: str) -> set[str]:
+    """What GitHub calls the headings of a page."""
+    titles = re.findall(r"^#+ (.+)$", text, re.M)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
 def test_links_lead_somewhere() -> None:
     pages = [path.relative_to(ROOT) for path in (ROOT / "docs").glob("*.md")]
     for page in ("README.md", "bags/README.md", *pages):
         text = (ROOT / page).read_text()
-        for target in re.findall(r"\]\(([^)#]+)[^)]*\)", text):
-            assert (ROOT / page).parent.joinpath(target).exists(), (page, target)
+        for target, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", text):
+            there = (ROOT / page).parent / target if target else ROOT / page
+            assert there.exists(), (page, target)
+            assert not anchor or anchor in anchors(there.read_text()), (page, target, anchor)
