@@ -85,6 +85,7 @@ class CycledBag:
     def __init__(self, frames: Frames, count: int) -> None:
         self.path, self.start_ns = Path("cycled"), _PERIOD_NS
         self.topics = {"/image": Topic(IMAGE, count)}
+        self.problems: list[str] = []
         self._frames, self._count = frames, count
 
     def messages(self, *_: object) -> Iterator[tuple[str, str, int, bytearray]]:

@@ -12,15 +12,17 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from ofsat_ros.pixels import Regions, interpolate
 from ofsat_ros.star_field import StarFieldMotion
+
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
 
 Array = NDArray[np.float64]
 Plane = NDArray[np.float32]
@@ -90,6 +92,8 @@ class PastFrame:
     @cached_property
     def object_tree(self) -> KDTree:
         """Their places in the sky plane, for searches."""
+        from scipy.spatial import KDTree  # not before it is asked for: it takes its time
+
         return KDTree(self.object_sky)
 
     def sky(self, xy: Array) -> Array:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from numpy.typing import ArrayLike, NDArray
 
 from ofsat_ros.camera.model import Camera, CameraError, to_radec
 from ofsat_ros.parameters import CameraParameters
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
@@ -24,6 +27,13 @@ _KEPT = 100_000
 _PART = {"middle": 0.0, "start": 0.5, "end": -0.5}
 
 
+def _rotation(quaternion: ArrayLike) -> Rotation:
+    # The first frames need not wait for it.
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_quat(quaternion)
+
+
 def rotation_of(x: float, y: float, z: float, w: float) -> Rotation:
     """Return the rotation that a message's quaternion stands for.
 
@@ -35,7 +45,7 @@ def rotation_of(x: float, y: float, z: float, w: float) -> Rotation:
     norm = float(np.sqrt(x * x + y * y + z * z + w * w))
     if not abs(norm - 1) <= _NORM_TOLERANCE:
         raise CameraError(f"a quaternion of length {norm:.6g} is no rotation; it must be 1")
-    return Rotation.from_quat([x, y, z, w])
+    return _rotation([x, y, z, w])
 
 
 class Attitudes:
@@ -104,7 +114,7 @@ class Attitudes:
             if max(stamp_ns - stamps[after - 1], stamps[after] - stamp_ns) > age_ns:
                 why = "an attitude beside the frame is farther away than attitude_max_age_s"
         if not away_ns or (why and away_ns <= _SAME_NS):
-            return Rotation.from_quat(self._quaternions[nearest]), ""
+            return _rotation(self._quaternions[nearest]), ""
         return (None, why) if why else (self._turned(*pair, stamp_ns), "")
 
     def _rate_from(self, stamp_ns: int, age_ns: int) -> int:
@@ -123,9 +133,9 @@ class Attitudes:
         # Half of it, as accurate for small angles as for large ones.
         angle = 2 * np.arctan2(np.linalg.norm(second - first), np.linalg.norm(second + first))
         if not angle:
-            return Rotation.from_quat(first)
+            return _rotation(first)
         weights = np.sin([(1 - part) * angle, part * angle])
-        return Rotation.from_quat(weights[0] * first + weights[1] * second)
+        return _rotation(weights[0] * first + weights[1] * second)
 
 
 class Astrometry:

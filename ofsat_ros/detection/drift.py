@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter
 
 from ofsat_ros.history import History, PastFrame
 
@@ -281,7 +281,9 @@ def _weights(frame: PastFrame, rows: NDArray[np.intp]) -> Array:
     x, y = pixels.astype(np.intp).transpose(3, 0, 1, 2)
     owner = frame.regions.at(y, x)
     others = (owner >= 0) & (owner != rows[:, None, None])
-    return np.where(maximum_filter(others, (1, 5, 5), mode="constant"), 0, _WEIGHT)
+    padded = np.pad(others, [(0, 0), (2, 2), (2, 2)])
+    beside = sliding_window_view(padded, (5, 5), (1, 2)).any(axis=(3, 4))
+    return np.where(beside, 0, _WEIGHT)
 
 
 def _flow_against_field(

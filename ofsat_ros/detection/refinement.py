@@ -31,6 +31,9 @@ _WINDOW_VARIANCE = 0.5
 # Half side of the window of a centroid, and how far it may run, px.
 _WINDOW_PX, _FARTHEST_PX = 5, 2.0
 _STEPS = np.arange(-_WINDOW_PX, _WINDOW_PX + 1)
+# Places across a streak, px, and the pixels around a place between them.
+_ACROSS = np.arange(-_ACROSS_PX, _ACROSS_PX + 1.0)
+_CORNERS = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])
 # A centroid that moves by less stays, px.
 _STILL_PX = 0.01
 
@@ -70,31 +73,53 @@ def refine(
     refined = spots.copy()
     ways = np.hypot(motions[:, 0], motions[:, 1])
     points = np.ones(len(spots), bool)
-    for row in np.flatnonzero(ways > _WAY_PX):
-        behind = [
-            other for other, itself in zip(others, hidden[:, row], strict=True) if not itself
-        ]
-        streak = _refined_streak(frame, behind, spots[row], motions[row] / ways[row], ways[row])
+    moving = np.flatnonzero(ways > _WAY_PX)
+    directions = motions[moving] / ways[moving, None]
+    strips = [
+        _strip(spot, direction, reach)
+        for spot, direction, reach in zip(spots[moving], directions, ways[moving], strict=True)
+    ]
+    lights = _lights(frame, others, strips, hidden[:, moving])
+    for row, direction, light in zip(moving, directions, lights, strict=True):
+        streak = _refined_streak(frame, spots[row], direction, ways[row], light)
         if streak is not None:
             refined[row], points[row] = streak, False
     refined[points] = _refined_points(frame, others, spots[points], hidden[:, points])
     return refined
 
 
-def _refined_streak(
-    frame: PastFrame,
-    others: Sequence[PastFrame],
-    spot: np.void,
-    direction: Array,
-    reach: float,
-) -> np.void | None:
-    """The spot as a streak along a direction; None if it is none."""
+def _strip(spot: np.void, direction: Array, reach: float) -> Array:
+    """Points around a spot along a direction and across, (N, M, 2) px."""
     half = int(np.ceil(min(reach, _LONGEST_STREAK_PX))) + _POINT_REACH_PX
-    along, across = np.arange(-half, half + 1.0), np.arange(-_ACROSS_PX, _ACROSS_PX + 1.0)
+    along = np.arange(-half, half + 1.0)
     normal = np.array([-direction[1], direction[0]])
     start = np.array([spot["x"], spot["y"]])
-    points = start + along[:, None, None] * direction + across[None, :, None] * normal
-    light = _light_between(frame, others, points.reshape(-1, 2)).reshape(len(along), -1)
+    return start + along[:, None, None] * direction + _ACROSS[None, :, None] * normal
+
+
+def _lights(
+    frame: PastFrame,
+    others: Sequence[PastFrame],
+    strips: Sequence[Array],
+    hidden: NDArray[np.bool_],
+) -> list[Array]:
+    """The light at points of S strips, given which of the others show each's source, (F, S)."""
+    if not strips:
+        return []
+    points = np.concatenate([strip.reshape(-1, 2) for strip in strips])
+    sizes = [strip.shape[0] * strip.shape[1] for strip in strips]
+    light = _light_between(frame, others, points, np.repeat(hidden, sizes, axis=1))
+    parts = np.split(light, np.cumsum(sizes)[:-1])
+    return [part.reshape(strip.shape[:2]) for part, strip in zip(parts, strips, strict=True)]
+
+
+def _refined_streak(
+    frame: PastFrame, spot: np.void, direction: Array, reach: float, light: Array
+) -> np.void | None:
+    """The spot as a streak along a direction, given the light of its strip; None if it is none."""
+    across, along = _ACROSS, np.arange(len(light)) - len(light) // 2
+    normal = np.array([-direction[1], direction[0]])
+    start = np.array([spot["x"], spot["y"]])
     weight = np.exp(-(across**2) / (2 * POINT_WIDTH_PX**2))
     profile = _profile(light, weight)
     first, last = _segment(profile, reach, _noise_across(weight) * frame.noise)
@@ -122,25 +147,25 @@ def _refined_streak(
     return refined
 
 
-def _light_between(frame: PastFrame, others: Sequence[PastFrame], points: Array) -> Array:
+def _light_between(
+    frame: PastFrame, others: Sequence[PastFrame], points: Array, hidden: NDArray[np.bool_]
+) -> Array:
     """The light at points between pixels, (N, 2) px, less that of the stars, (N,) DN.
 
     NaN beside bright stars: what is left of a star must not pass for a streak.  Outside of the
-    image there is none.
+    image there is none.  What others show where `hidden`, (F, N), does not count.
     """
     inside = frame.contains(points, 1.0)
     corner = np.floor(points[inside]).astype(np.intp)
     part = points[inside] - corner
-    found = np.zeros(len(corner))
-    for x, y in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        pixels = corner + np.array([x, y], np.intp)
-        light = frame.smoothed[pixels[:, 1], pixels[:, 0]].astype(np.float64)
-        if others and len(pixels):
-            star = star_light(frame, others, pixels).star
-            light = np.where(_STAR_LEFT * star < _STAR_SIGMAS * frame.noise, light - star, np.nan)
-        found += light * np.abs(1 - x - part[:, 0]) * np.abs(1 - y - part[:, 1])
+    pixels = (corner + _CORNERS[:, None]).reshape(-1, 2)
+    values = frame.smoothed[pixels[:, 1], pixels[:, 0]].astype(np.float64)
+    if others and len(pixels):
+        star = star_light(frame, others, pixels, np.tile(hidden[:, inside], 4)).star
+        values = np.where(_STAR_LEFT * star < _STAR_SIGMAS * frame.noise, values - star, np.nan)
+    weight = np.abs(1 - _CORNERS[:, None] - part).prod(axis=2)
     light = np.zeros(len(points))
-    light[inside] = found
+    light[inside] = (values.reshape(4, -1) * weight).sum(axis=0)
     return light
 
 

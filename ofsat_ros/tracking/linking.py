@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln
 
 from ofsat_ros.tracking.sightings import Places, Sighting, Vicinity
 
@@ -309,12 +308,13 @@ class _Paths:
         """Paths that chance explains less often than the limit."""
         # What chance could choose only makes them less sure.
         paths = self.only((self._log_false < log_limit) & (self.count >= 3))
-        k, n = paths.count, paths._since_first
+        k, n = paths.count.astype(np.intp), paths._since_first
         # When it began, and in which frames between it was missed, is what chance could choose.
+        log_gamma = np.array([math.inf, *map(math.lgamma, range(1, n.max(initial=0) + 1))])
         choices = (
-            gammaln(n - 1)
-            - gammaln(k - 1)
-            - gammaln(n - k + 1)
+            log_gamma[n - 1]
+            - log_gamma[k - 1]
+            - log_gamma[n - k + 1]
             + np.log(np.maximum(paths._visible - 2, 1))
         )
         log_false = paths._log_false + choices

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from ofsat_ros.detection import BORDER_PX, CANDIDATE, CONFIRMED, DETECTION_DTYPE, SPOT_DTYPE, Drift
 from ofsat_ros.history import History, PastFrame
@@ -25,7 +24,6 @@ from ofsat_ros.tracking.track import Hit, Track, add_hits, covariances, places, 
 Array = NDArray[np.float64]
 # Looks in a frame, compared with others, near a point: none or one SPOT_DTYPE.
 Look = Callable[[PastFrame, Sequence[PastFrame], Array], NDArray[np.void]]
-
 # Measures spots of a frame again, compared with others, given their displacements per frame, px,
 # and which of the others show them, too.
 Refine = Callable[
@@ -228,6 +226,8 @@ class Tracker:
         """Rows of tracks, and the spot of each, such that their distances are least in all."""
         if not self._tracks:
             return np.zeros(0, np.intp), np.zeros(0, SPOT_DTYPE)
+        from scipy.optimize import linear_sum_assignment  # no frame without tracks waits for it
+
         row, column, spots, distance = _candidates(self._tracks, frame, sighting)
         # What is beyond the gate must not weigh in what others get.
         good = np.flatnonzero(distance < _GATE_SIGMAS**2)
