@@ -109,18 +109,63 @@ def test_pictures_get_the_times_that_are_given(tmp_path: Path):
     assert set(np.diff([frame.stamp_ns for frame in frames])) == {SECOND // 4}
 
 
-def test_several_inputs_cannot_all_start_at_the_same_time(tmp_path: Path):
-    for i in range(2):
+def test_several_pictures_are_one_recording_that_starts_when_it_is_told(tmp_path: Path):
+    for i in range(11):
         cv2.imwrite(f"{tmp_path}/frame{i}.png", image(i, "uint8"))
     names = sorted(tmp_path.glob("*.png"))
-    said = fails(1, "import", *names, "-o", tmp_path / "bag", "--fps", 4)
-    assert said.startswith("ofsat: --fps counts from the beginning of each INPUT")
+    times = ("--fps", 4, "--exposure", 0.1, "--start", "2026-01-01T01:00:00+01:00")
+    succeeds("import", *names, "-o", tmp_path / "bag", *times)
+    frames, _ = frames_of(tmp_path / "bag")
+    # The middle of the exposures; frame 2 comes before frame 10.
+    wanted = [START + SECOND // 20 + i * SECOND // 4 for i in range(11)]
+    assert [frame.stamp_ns for frame in frames] == wanted
+    for i, frame in enumerate(frames):
+        assert np.array_equal(frame.image, image(i, "uint8"))
 
 
-def test_frames_of_the_same_time_are_said(tmp_path: Path):
-    files = write_fits(tmp_path / "night", 2)
-    done = succeeds("import", *files, files[0], "-o", tmp_path / "bag")
-    assert done.stderr.startswith("note: 1 frames have the time of another frame")
+def test_copies_are_left_out_and_said(tmp_path: Path):
+    files = write_fits(tmp_path / "night", 3)
+    copy = tmp_path / "night" / "light_0 (1).fits"
+    copy.write_bytes(files[0].read_bytes())
+    done = succeeds("import", *files, copy, files[1], "-o", tmp_path / "bag")
+    assert done.stdout == f"3 frames on {TOPIC} are in {tmp_path}/bag\n"
+    assert "note: left out, as copies of other files: light_0 (1).fits" in done.stderr
+
+
+def test_several_bags_of_a_night_are_one(tmp_path: Path):
+    for name, first in (("a", 3), ("b", 0)):  # against the order of names
+        with BagWriter(tmp_path / name) as bag:
+            for i in range(first, first + 3):
+                bag.write_image(TOPIC, image(i), START + i * SECOND, "optical")
+    done = succeeds("import", tmp_path / "a", tmp_path / "b", "-o", tmp_path / "bag")
+    assert done.stdout.startswith("6 frames on")
+    frames, _ = frames_of(tmp_path / "bag")
+    assert [frame.stamp_ns for frame in frames] == [START + i * SECOND for i in range(6)]
+    write_fits(tmp_path / "night")
+    said = fails(1, "import", tmp_path / "a", tmp_path / "night", "-o", tmp_path / "more")
+    assert "are of several kinds, " in said
+    assert f"{tmp_path}/a (bag) and {tmp_path}/night (FITS)" in said
+
+
+def test_a_bag_of_files_gives_the_detections_of_the_files(tmp_path: Path):
+    succeeds("simulate", "-o", tmp_path / "sky", "--frames", 10, "--size", 160, 120)
+    frames, _ = frames_of(tmp_path / "sky")
+    (tmp_path / "night").mkdir()
+    for frame in frames:
+        middle = np.datetime64(frame.stamp_ns, "ns")
+        header = solution(frame.number).to_header()
+        header["DATE-OBS"], header["EXPTIME"] = f"{middle - np.timedelta64(250, 'ms')}", 0.5
+        fits.writeto(tmp_path / "night" / f"{frame.number}.fits", frame.image, header)
+    files = (tmp_path / "night").glob("*.fits")
+    succeeds("import", *files, "-o", tmp_path / "bag")
+    results = []
+    for name in ("night", "bag"):
+        output = tmp_path / f"{name}_results"
+        succeeds("process", tmp_path / name, "-o", output)
+        results.append(np.genfromtxt(output / "detections.csv", delimiter=",", skip_header=1))
+    assert len(results[0]) > 5
+    # The stages add up in an order of their own: not to the last digit of nine.
+    np.testing.assert_allclose(*results, rtol=1e-5, atol=1e-6)
 
 
 def test_a_bag_gives_the_same_bag_with_its_directions(tmp_path: Path):
@@ -145,7 +190,9 @@ def test_what_cannot_be_read_among_others_is_left_out_and_said(tmp_path: Path):
     files = write_fits(tmp_path / "night")
     files[1].write_bytes(b"no FITS at all")
     done = succeeds("import", *files, "-o", tmp_path / "bag")
-    assert done.stdout == f"2 frames on {TOPIC} are in {tmp_path}/bag\n"
+    assert done.stdout == (
+        f"2 frames (1 more could not be read) on {TOPIC} are in {tmp_path}/bag\n"
+    )
     assert "light_1.fits" in done.stderr
 
 

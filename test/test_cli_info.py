@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from ofsat_ros.camera import Camera
 from ofsat_ros.cli import survey
 from ofsat_ros.recordings import IMAGE, BagWriter, Frame
+from ofsat_ros.recordings.salvage.mcap import McapWreck
 
 TOPIC = "/camera/image_raw"
 START = 1_767_225_600_000_000_000  # 2026-01-01
@@ -184,6 +185,37 @@ def test_what_is_given_goes_into_the_command(tmp_path: Path):
     images = told(tmp_path, "--fps", 4, "--exposure", 0.2)["images"][0]
     assert shlex.split(images["command"])[5:] == ["--fps", "4.0", "--exposure", "0.2"]
     assert (images["interval_s"], images["exposures_s"]) == (0.25, [0.2])
+
+
+def test_several_files_are_told_as_one_recording(tmp_path: Path):
+    for i in range(5):
+        fits.writeto(tmp_path / f"light_{i}.fits", image())
+    files = sorted(tmp_path.glob("*.fits"))
+    options = ("--fps", 4, "--start", "2026-01-01T00:00Z")
+    about = told(*files[:3], *options)
+    assert about["path"] == [f"{file}" for file in files[:3]]
+    (images,) = about["images"]
+    assert (images["frames"], images["first_stamp_ns"]) == (3, START)
+    command = shlex.split(images["command"])
+    assert command[2:5] == about["path"]
+    assert command[-4:] == ["--fps", "4.0", "--start", "2026-01-01T00:00:00Z"]
+    # Hundreds of names are not repeated.
+    text = succeeds("info", *files, *options).stdout
+    assert text.splitlines()[0] == f"{files[0]} and 4 more: FITS"
+    verdict = "It can be processed: ofsat process, with the same names and options"
+    assert text.splitlines()[-1] == verdict
+    assert "'soon' is no date and time: give it as" in fails(2, "info", *files, "--start", "soon")
+
+
+def test_a_bag_is_opened_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    # A torn one is looked through at each opening.
+    path = write(tmp_path / "bag", [0, 1, 2])
+    (file,) = path.glob("*.mcap")
+    file.write_bytes(file.read_bytes()[:-200])
+    scans, scan = [], McapWreck.scan
+    monkeypatch.setattr(McapWreck, "scan", lambda wreck: (scans.append(wreck), scan(wreck)))
+    assert told(path)["topics"][TOPIC]["messages"] == 3
+    assert len(scans) == 1
 
 
 # What cannot be processed

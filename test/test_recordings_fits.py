@@ -2,6 +2,7 @@
 
 import contextlib
 import gzip
+import re
 import sys
 
 import astropy.units as u
@@ -142,7 +143,7 @@ def test_images_of_a_cube_are_as_far_apart_as_its_header_or_the_user_says(
     path = write(tmp_path / "a.fits", cube, **cards)
     with open_recording(path, fps=fps) as recording:
         stamps = [frame.stamp_ns for frame in recording]
-        assert not [words for words in recording.problems if "gap" in words]
+        assert not [words for words in recording.problems if "gap" in words or "--fps" in words]
     np.testing.assert_array_equal(np.diff(stamps), step_s * NS)
 
 
@@ -241,8 +242,9 @@ def test_a_folder_is_read_in_the_order_of_its_headers_times(tmp_path):
         frames = list(recording)
         assert len(recording) == 12
         assert recording.skipped == 0
-        (problem,) = recording.problems
+        problem, beside = recording.problems
     assert "half of the exposure is added" in problem
+    assert beside == f"not read, as they are beside the FITS files of {folder}: 1 picture file"
     for number, frame in enumerate(frames):
         np.testing.assert_array_equal(frame.image, scene(number))
         assert frame.stamp_ns == FIRST_NS + 2 * number * NS + NS // 4
@@ -459,3 +461,112 @@ def test_a_second_look_is_the_same(tmp_path):
     assert [frame.stamp_ns for frame in first] == [frame.stamp_ns for frame in again]
     for one, other in zip(first, again, strict=True):
         np.testing.assert_array_equal(one.image, other.image)
+
+
+# What real folders hold --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("cards", "kinds"),
+    [
+        ([{"IMAGETYP": "DARK"}, {"IMAGETYP": "Bias Frame"}], "1 Bias Frame, 1 DARK"),
+        ([{"FRAMETYP": "Flat"}, {"FRAME": "Dark"}], "1 Dark, 1 Flat"),
+        ([{"STACKCNT": 12}, {"IMAGETYP": "FLATDARK"}], "1 FLATDARK, 1 stack"),
+    ],
+)
+def test_darks_and_their_like_are_left_out_and_said(tmp_path, cards, kinds):
+    folder = night(tmp_path / "night", IMAGETYP="Light Frame")
+    for number, others in enumerate(cards):
+        write(folder / f"_{len(cards) - number}.fits", scene(9), **others)
+    with open_recording(folder) as recording:
+        assert [frame.image[0, 0] for frame in recording] == [scene(n)[0, 0] for n in range(3)]
+        (said,) = [words for words in recording.problems if "no single frames of the sky" in words]
+        assert (len(recording), recording.skipped) == (3, 0)
+    assert said.endswith(f": {kinds} (first _1.fits)")
+
+
+def test_darks_alone_are_read(tmp_path):
+    folder = night(tmp_path / "night", IMAGETYP="DARK")
+    with open_recording(folder) as recording:
+        assert len(list(recording)) == 3
+
+
+def test_a_time_with_a_zone_is_turned_to_utc(tmp_path):
+    cards = {"DATE-OBS": "2026-11-22T05:34:05.123456789+02:30", "EXPTIME": None}
+    assert only_frame(write(tmp_path / "a.fits", scene(1), **cards)).stamp_ns == FIRST_NS
+
+
+@pytest.mark.parametrize(
+    ("cards", "said"),
+    [
+        ({"DATE-OBS": (FIRST, "local time")}, "DATE-OBS is local time; it is taken for UTC"),
+        ({"TIMESYS": "LOCAL"}, "DATE-OBS is local time; it is taken for UTC"),
+        ({"MJD-OBS": MJD - 2 / 24}, r"2 h later than MJD-OBS; .* --stamp-offset-s -7200"),
+        ({"JD": MJD + 2400000.5 + 0.25}, r"6 h earlier than JD; .* --stamp-offset-s 21600"),
+        ({"DATE-OBS": (FIRST, "UTC, by the local clock")}, ""),
+        ({"MJD-OBS": MJD, "DATE-AVG": "2026-11-22T03:04:05.4"}, ""),
+    ],
+)
+def test_what_may_be_local_time_is_said(tmp_path, cards, said):
+    with open_recording(write(tmp_path / "a.fits", scene(1), **cards)) as recording:
+        (frame,) = recording
+        words = " ".join(recording.problems)
+    assert abs(frame.stamp_ns - FIRST_NS) < NS
+    assert re.search(said, words)
+    assert ("--stamp-offset-s" in words) == bool(said)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "comment"),
+    [
+        ("EXPOINUS", 500_000, "Exposure time in us"),
+        ("EXPTIME", 500, "exposure time in ms"),
+        ("EXPTIME", 0.5, "[s] Exposure duration"),
+        ("EXPOSURE", 0.5, "Exposure time in seconds"),
+    ],
+)
+def test_exposures_have_the_unit_of_their_comments(tmp_path, name, value, comment):
+    cards = {"EXPTIME": None, name: (value, comment)}
+    assert only_frame(write(tmp_path / "a.fits", scene(1), **cards)).exposure_s == 0.5
+
+
+def test_cards_that_cannot_be_understood_are_not_there(tmp_path):
+    path = write(tmp_path / "a.fits", scene(1), GAIN=7)
+    card = b"GAIN    =                    7"
+    assert card in path.read_bytes()
+    path.write_bytes(path.read_bytes().replace(card, b"CRVAL1  = 'unfinished         "))
+    assert only_frame(path).stamp_ns == FIRST_NS + NS // 4
+
+
+def test_several_sets_of_the_same_exposures_are_said(tmp_path):
+    folder = night(tmp_path / "night")
+    night(folder, name="solved_{}.fits", SOLVED=True)
+    with open_recording(folder) as recording:
+        said = recording.problems[-1]
+    assert said.startswith("3 images have the same time as another one, ")
+    assert "keep one of them in the folder" in said
+
+
+def test_files_of_several_folders_are_one_recording(tmp_path):
+    first = night(tmp_path / "first")
+    second = night(tmp_path / "second", 6)  # of the same times in part
+    files = [*second.glob("light_[012].fits"), first]
+    with open_recording(files) as recording:
+        frames = list(recording)
+        assert recording.path == tmp_path
+    assert [frame.stamp_ns for frame in frames] == [
+        FIRST_NS + NS // 4 + 2 * number * NS for number in range(6)
+    ]
+    for number, frame in enumerate(frames):
+        np.testing.assert_array_equal(frame.image, scene(number))
+
+
+def test_a_begin_that_is_given_counts_where_headers_tell_none(tmp_path):
+    for number in range(3):
+        write(tmp_path / f"{number}.fits", scene(number), **{"DATE-OBS": None})
+    with open_recording(tmp_path, fps=2, exposure_s=0.2, start_ns=FIRST_NS) as recording:
+        stamps = [frame.stamp_ns for frame in recording]
+        assert recording.problems == []
+    assert stamps == [FIRST_NS + NS // 10 + number * NS // 2 for number in range(3)]
+    with open_recording(night(tmp_path / "night"), fps=3, start_ns=1) as recording:
+        assert "not from --start and --fps 3" in recording.problems[-1]

@@ -165,7 +165,7 @@ def test_what_is_nothing_known_is_answered_with_what_is(tmp_path):
         open_recording(tmp_path / "nowhere")
     (tmp_path / "notes.txt").write_text("clear")
     known = r"\.mcap, .*\.fits, .*\.ser, .*\.mp4, .*\.png"
-    with pytest.raises(RecordingError, match=f"neither a metadata.yaml nor .* ends in {known}"):
+    with pytest.raises(RecordingError, match=f"neither a metadata.yaml, .* ends in {known}"):
         open_recording(tmp_path)
     with pytest.raises(RecordingError, match=f"is no recording known here: .* ends in {known}"):
         open_recording(tmp_path / "notes.txt")
@@ -175,3 +175,25 @@ def test_what_is_nothing_known_is_answered_with_what_is(tmp_path):
 def test_a_rate_or_exposure_that_is_none_is_refused(tmp_path, options):
     with pytest.raises(RecordingError, match="must be greater than 0"):
         open_recording(folder_of(tmp_path / "night", ".png", np.uint8), **options)
+
+
+def test_every_page_of_a_tiff_is_a_frame(tmp_path):
+    pages = [scene(number) for number in range(4)]
+    assert cv2.imwritemulti(str(tmp_path / "stack.tif"), pages)
+    cv2.imwrite(str(tmp_path / "stack10.tif"), scene(9))
+    with open_recording(tmp_path, fps=2, start_ns=FIRST_NS) as recording:
+        frames = list(recording)
+        assert recording.problems == []
+    for number, (frame, page) in enumerate(zip(frames, [*pages, scene(9)], strict=True)):
+        np.testing.assert_array_equal(frame.image, page)
+        assert frame.stamp_ns == FIRST_NS + number * NS // 2
+
+
+def test_a_path_that_is_no_unicode_does_not_end_the_process(tmp_path):
+    # As of a USB stick that another system has written; the surrogate is how Python holds it.
+    path = folder_of(tmp_path / "night", ".png", np.uint8).rename(tmp_path / "n\udce4cht")
+    with open_recording(path, fps=2) as recording:
+        assert len(list(recording)) == 3
+    (path / "night0.tif").write_bytes(b"")
+    with pytest.raises(RecordingError, match="OpenCV cannot open a file whose path is no Unicode"):
+        open_recording(path / "night0.tif", fps=2)

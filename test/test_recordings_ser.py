@@ -252,3 +252,59 @@ def test_content_tells_where_the_name_does_not_and_a_folder_has_one(tmp_path):
         open_recording(tmp_path)
     with pytest.raises(RecordingError, match="is no bag, and has no topics to choose"):
         open_recording(tmp_path / "b.ser", "/image")
+
+
+@pytest.mark.parametrize("zone_h", [-5.5, 0, 1, 12.75])
+@pytest.mark.parametrize("local", [False, True])
+def test_local_times_of_frames_become_utc(tmp_path, zone_h, local):
+    zone_ns = round(zone_h * 3600) * NS
+    header = {
+        "DateTime": ticks(FIRST_NS + zone_ns - 2 * NS),
+        "DateTime_UTC": ticks(FIRST_NS - 2 * NS),
+    }
+    shift = zone_ns // 100 if local else 0
+    stamps = [each + shift for each in stamps_of(3)]
+    path = write(tmp_path / "a.ser", [scene(n) for n in range(3)], stamps, **header)
+    with open_recording(path) as recording:
+        assert [frame.stamp_ns - FIRST_NS for frame in recording] == [0, 50_000_000, 100_000_000]
+        said = [words for words in recording.problems if "local time" in words]
+    assert len(said) == bool(shift)
+    assert not said or f"{zone_h:+g} h from UTC" in said[0]
+
+
+def test_a_begin_that_is_given_counts_where_frames_have_no_times(tmp_path):
+    path = write(tmp_path / "a.ser", [scene(0)] * 3, DateTime=ticks(FIRST_NS))
+    with open_recording(path, fps=20) as recording:
+        assert next(iter(recording)).stamp_ns == FIRST_NS
+        assert "local time, taken for UTC: --start would give it" in recording.problems[0]
+    start_ns = FIRST_NS + 3600 * NS
+    with open_recording(path, fps=20, exposure_s=0.01, start_ns=start_ns) as recording:
+        stamps = [frame.stamp_ns for frame in recording]
+        assert recording.problems == []
+    assert stamps == [start_ns + 5_000_000 + n * 50_000_000 for n in range(3)]
+    with open_recording(three(tmp_path / "b.ser"), start_ns=start_ns) as recording:
+        assert next(iter(recording)).stamp_ns == FIRST_NS
+        assert recording.problems[0] == "the times are those of the file, and not from --start"
+
+
+def test_several_files_come_in_the_order_of_time(tmp_path):
+    later = [each + 10_000_000 for each in stamps_of(2)]
+    paths = [
+        write(tmp_path / "a.ser", [scene(3), scene(4)], later),
+        three(tmp_path / "b.ser"),
+    ]
+    with open_recording(paths) as recording:
+        assert (recording.path, recording.kind, len(recording)) == (tmp_path, "SER", 5)
+        frames = list(recording)
+        assert (recording.skipped, len(recording.problems)) == (0, 1)
+    for number, frame in enumerate(frames):
+        np.testing.assert_array_equal(frame.image, scene(number))
+        assert frame.number == number
+    assert np.all(np.diff([frame.stamp_ns for frame in frames]) > 0)
+    # What is torn costs no other.
+    data = paths[1].read_bytes()
+    paths[1].write_bytes(data[: 178 + 2 * 2 * HEIGHT * WIDTH + 5])
+    with pytest.raises(RecordingError, match=r"b\.ser has no times of its frames"):
+        open_recording(paths)
+    with pytest.raises(RecordingError, match="--fps 20 counts from the begin of one SER file"):
+        open_recording(paths, fps=20)

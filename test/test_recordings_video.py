@@ -116,3 +116,33 @@ def test_more_bits_than_opencv_gives_are_told(tmp_path, monkeypatch):
     monkeypatch.setattr("ofsat_ros.recordings.video._GREY_16", b"none")
     with open_recording(path, fps=1) as recording:
         assert "has 16 bits, and OpenCV gives the highest 8" in recording.problems[-1]
+
+
+def test_a_begin_that_is_given_counts(tmp_path):
+    path = write(tmp_path / "a.avi", "MJPG")
+    start_ns = 1_795_316_645 * NS
+    with open_recording(path, exposure_s=0.02, start_ns=start_ns) as recording:
+        stamps = [frame.stamp_ns for frame in recording]
+        (rate,) = recording.problems
+    assert "the rate, 12.5 frames a second" in rate
+    # The middle of the exposures.
+    assert stamps == [start_ns + NS // 100 + n * NS * 2 // 25 for n in range(12)]
+
+
+def test_parts_of_a_video_follow_each_other_as_people_number_them(tmp_path):
+    parts = [write(tmp_path / "a_2.avi", "FFV1", 5), write(tmp_path / "a_10.avi", "FFV1", 7)]
+    with open_recording(reversed(parts)) as recording:
+        assert (recording.path, len(recording)) == (tmp_path, 12)
+        for _ in range(2):
+            frames = list(recording)
+            assert recording.skipped == 0
+    assert [frame.number for frame in frames] == list(range(12))
+    assert [frame.stamp_ns for frame in frames] == [n * NS * 2 // 25 for n in range(12)]
+    for number, frame in enumerate(frames):
+        wanted = scene(number if number < 5 else number - 5)
+        assert np.abs(frame.image.astype(float) - wanted).mean() < 1
+    write(tmp_path / "a_11.avi", "FFV1", fps=25)
+    with pytest.raises(RecordingError, match=r"different rates, 12.5 to 25 .* as in --fps 20"):
+        open_recording(tmp_path.glob("a_1?.avi"))
+    with pytest.raises(RecordingError, match=r"several recordings; open one of .* give the names"):
+        open_recording(tmp_path)

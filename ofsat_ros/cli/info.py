@@ -13,83 +13,82 @@ from typing import Any
 import click
 
 from ofsat_ros.cli.survey import survey
-from ofsat_ros.cli.terminal import fail, help_all, recording_options
-from ofsat_ros.recordings import Bag, RecordingError, open_recording
+from ofsat_ros.cli.terminal import (
+    fail,
+    help_all,
+    process_words,
+    recording_argument,
+    recording_options,
+)
+from ofsat_ros.recordings import RecordingError, Topic, TopicError, open_recording
+
+_PATHS_SHOWN = 3
 
 
 @click.command("info", epilog="Example: ofsat info night1")
-@click.argument("path", metavar="RECORDING", type=click.Path(path_type=Path))
+@recording_argument
 @recording_options
 @click.option("--json", "as_json", is_flag=True, help="print JSON instead of words")
 @help_all
-def command(path: Path, topic: str | None, as_json: bool, **options: Any) -> None:
+def command(paths: tuple[Path, ...], as_json: bool, **options: Any) -> None:
     """Say what RECORDING holds, and whether it can be processed.
 
     RECORDING is what process reads: a bag, FITS, SER, a video, images; a file, or a folder of
-    them.  Every frame is read.  The exit code is 0 if it can be processed, and 1 if not.
+    them; several are taken for one.  Every frame is read.  The exit code is 0 if it can be
+    processed, and 1 if not.
     """
-    told: dict[str, Any] = {"path": f"{path}", "kind": "", "topics": {}, "images": []}
-    told["topics"], encodings = _of_bag(path)
+    told: dict[str, Any] = {"path": _json_of(paths), "kind": "", "topics": {}, "images": []}
     problem = ""
     try:
-        for name in encodings if encodings and topic is None else [topic]:
-            with open_recording(path, name, **options) as recording:
-                about = survey(recording)
-                about["encoding"] = encodings.get(recording.topic, "")
-                told["kind"] = recording.kind
-            chosen = about["topic"] if len(encodings) > 1 else None
-            about["command"] = _command(path, {"topic": chosen, **options})
-            told["images"].append(about)
-            if about["stopped"]:
-                break
+        try:
+            _add(told, paths, options)
+        except TopicError as error:
+            told["topics"] = _topics(error.topics)
+            images = [name for name, about in error.topics.items() if about.is_image]
+            filled = [name for name in images if error.topics[name].count]
+            if not filled:
+                raise
+            for name in filled:
+                _add(told, paths, {**options, "topic": name})
+                if told["images"][-1]["stopped"]:
+                    break
     except (RecordingError, OSError) as error:
         if not (told["topics"] or as_json):
             fail(error)
         problem = f"{error}"
     told["problem"] = problem
     told["processable"] = any(not about["hindrance"] for about in told["images"])
-    click.echo(json.dumps(told, indent=2) if as_json else "\n".join(_words(told)))
+    click.echo(json.dumps(told, indent=2) if as_json else "\n".join(_words(told, paths)))
     if any(about["stopped"] for about in told["images"]):
         sys.exit(130)
     sys.exit(0 if told["processable"] else 1)
 
 
-def _of_bag(path: Path) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return type and count of a bag's topics, and its images' encodings; empty if it is none."""
-    try:
-        with Bag(path) as bag:
-            topics = {
-                name: {"type": about.msgtype, "messages": about.count}
-                for name, about in bag.topics.items()
-            }
-            images = [name for name, about in bag.topics.items() if about.is_image and about.count]
-            return topics, {name: _encoding(bag, name) for name in images}
-    except RecordingError:  # which opening it as a recording will tell
-        return {}, {}
+def _add(told: dict[str, Any], paths: tuple[Path, ...], options: dict[str, Any]) -> None:
+    """Add what the images of one topic, or of files, tell."""
+    with open_recording(paths, **options) as recording:
+        told["kind"] = recording.kind
+        told["topics"] = told["topics"] or _topics(recording.contents)
+        about = survey(recording)
+    given = recording.topic if len(recording.topics) > 1 else None
+    about["command"] = shlex.join(process_words(paths, {**options, "topic": given}))
+    told["images"].append(about)
 
 
-def _encoding(bag: Bag, topic: str) -> str:
-    """Return what a topic's first message says of its encoding."""
-    try:
-        _, msgtype, _, data = next(bag.messages({topic}))
-        message = bag.deserialize(data, msgtype)
-    except (RecordingError, StopIteration):  # which reading its frames will tell
-        return ""
-    return str(message.encoding if hasattr(message, "encoding") else message.format).strip()
+def _topics(contents: dict[str, Topic]) -> dict[str, Any]:
+    return {
+        name: {"type": about.msgtype, "messages": about.count} for name, about in contents.items()
+    }
 
 
-def _command(path: Path, options: dict[str, Any]) -> str:
-    """Return the command that processes what was looked at."""
-    words = ["ofsat", "process", f"{path}", "-o", "results"]
-    for name, value in options.items():
-        if value is not None:
-            words += [f"--{name.removesuffix('_s').replace('_', '-')}", f"{value}"]
-    return shlex.join(words)
+def _json_of(paths: tuple[Path, ...]) -> str | list[str]:
+    return f"{paths[0]}" if len(paths) == 1 else [f"{path}" for path in paths]
 
 
-def _words(told: dict[str, Any]) -> Iterator[str]:
+def _words(told: dict[str, Any], paths: tuple[Path, ...]) -> Iterator[str]:
     """Yield the lines for people."""
-    yield f"{told['path']}: {told['kind'] or 'nothing that can be read'}"
+    more = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
+    yield f"{paths[0]}{more}: {told['kind'] or 'nothing that can be read'}"
     topics = told["topics"]
     for name, about in topics.items():
         yield f"  {name:<{max(map(len, topics))}}  {about['messages']:>7}  {about['type']}"
@@ -106,8 +105,10 @@ def _words(told: dict[str, Any]) -> Iterator[str]:
         what = about["topic"] if len(told["images"]) > 1 else "It"
         if about["hindrance"]:
             yield f"{what} cannot be processed: {about['hindrance']}"
-        else:
+        elif len(paths) <= _PATHS_SHOWN:
             yield f"{what} can be processed: {about['command']}"
+        else:
+            yield f"{what} can be processed: ofsat process, with the same names and options"
 
 
 def _lines(about: dict[str, Any]) -> Iterator[tuple[str, str]]:

@@ -31,6 +31,7 @@ class _Row(NamedTuple):
     low: float
     high: float
     exposure_s: float | None
+    encoding: str
 
 
 def survey(recording: Recording) -> dict[str, Any]:
@@ -66,6 +67,7 @@ def survey(recording: Recording) -> dict[str, Any]:
         "frames": len(rows),
         "skipped": recording.skipped,
         "sizes": [[*size, count] for size, count in Counter(r.size for r in rows).items()],
+        "encoding": ", ".join(dict.fromkeys(row.encoding for row in rows if row.encoding)),
         "pixels": sorted({row.pixels for row in rows}),
         "lowest": min((row.low for row in rows if row.low <= row.high), default=None),
         "highest": max((row.high for row in rows if row.low <= row.high), default=None),
@@ -101,7 +103,8 @@ def _row(frame: Frame) -> _Row:
     else:
         low, high = int(frame.image.min()), int(frame.image.max())
     size, pixels = (width, height), frame.image.dtype.name
-    return _Row(frame.number, frame.stamp_ns, size, pixels, low, high, frame.exposure_s)
+    times = frame.number, frame.stamp_ns
+    return _Row(*times, size, pixels, low, high, frame.exposure_s, frame.encoding)
 
 
 def _times(rows: list[_Row]) -> dict[str, Any]:

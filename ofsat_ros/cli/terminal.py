@@ -13,7 +13,7 @@ import click
 from tqdm import tqdm
 
 from ofsat_ros.parameters import Description, Table
-from ofsat_ros.recordings import RecordingError, remove_bag
+from ofsat_ros.recordings import RecordingError, remove_bag, utc_ns, utc_text
 
 _Command = Callable[..., None]
 _ALL = f"{__name__}.all"
@@ -73,10 +73,54 @@ def _option_type(about: Description) -> Any:
     return click.Choice(about.choices) if about.choices else type(about.default)
 
 
+class _Instant(click.ParamType):
+    """A date and a time, as ns UTC."""
+
+    name = "utc"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        if isinstance(value, int):
+            return value
+        try:
+            return utc_ns(value)
+        except ValueError as error:
+            self.fail(f"{error}: give it as 2026-03-01T22:15:00Z", param, ctx)
+
+
+# The options of `open_recording` whose names are not those of its arguments.
+_NAMES = {"exposure_s": "--exposure", "start_ns": "--start"}
+
+
+def recording_argument(command: _Command) -> _Command:
+    """Add the first argument of `open_recording`, as ``paths``."""
+    path = click.Path(path_type=Path)
+    return click.argument("paths", metavar="RECORDING...", nargs=-1, required=True, type=path)(
+        command
+    )
+
+
+def process_words(paths: tuple[Path, ...], options: dict[str, Any]) -> list[str]:
+    """Return the words of the command that processes recordings, with options by their names."""
+    words = ["ofsat", "process", *map(str, paths), "-o", "results"]
+    for name, value in options.items():
+        if value is not None:
+            if name == "start_ns":
+                value = utc_text(value)
+            words += [_NAMES.get(name, f"--{name.replace('_', '-')}"), f"{value}"]
+    return words
+
+
 def recording_options(command: _Command) -> _Command:
     """Add the options of `open_recording`, each by the name of its argument."""
     positive = click.FloatRange(min=0, min_open=True)
     for add in (
+        click.option(
+            "--start",
+            "start_ns",
+            type=_Instant(),
+            metavar="UTC",
+            help="when the first exposure began, where no frame has a time",
+        ),
         click.option(
             "--exposure",
             "exposure_s",
@@ -119,10 +163,15 @@ def fail(error: Exception | str) -> NoReturn:
     """End the command with exit code 1 and a line that says why."""
     if isinstance(error, Exception) and debugging():
         traceback.print_exception(error)
-    if isinstance(error, OSError) and error.strerror:
-        error = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    say(f"ofsat: {error}")
+    say(f"ofsat: {in_words(error)}")
     sys.exit(1)
+
+
+def in_words(error: Exception | str) -> str:
+    """Return what an error says, without numbers of the operating system."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    return f"{error}"
 
 
 def debugging() -> bool:

@@ -28,6 +28,7 @@ __all__ = [
     "Bag",
     "RecordingError",
     "Topic",
+    "TopicError",
 ]
 
 IMAGE = "sensor_msgs/msg/Image"
@@ -65,6 +66,20 @@ class Topic:
     def is_image(self) -> bool:
         """Whether its messages are images that can be decoded."""
         return self.msgtype in (IMAGE, COMPRESSED_IMAGE)
+
+
+class TopicError(RecordingError):
+    """A bag has no image topic, or several and none is chosen.
+
+    Attributes
+    ----------
+    topics : dict of str to Topic
+        All that it has.
+    """
+
+    def __init__(self, message: str, topics: dict[str, Topic]) -> None:
+        super().__init__(message)
+        self.topics = topics
 
 
 class Bag:

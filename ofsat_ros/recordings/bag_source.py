@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ofsat_ros.camera import Camera, CameraError, rotation_of
 from ofsat_ros.images import EncodingError, decode_message
-from ofsat_ros.recordings.bag import ATTITUDE, CAMERA_INFO, Bag, RecordingError
+from ofsat_ros.recordings.bag import ATTITUDE, CAMERA_INFO, Bag, RecordingError, TopicError
 from ofsat_ros.recordings.recording import Attitude, Frame, Skipped
 from ofsat_ros.recordings.storage import suffix_of
 
@@ -36,7 +36,8 @@ class BagSource:
         except RecordingError:
             bag.close()
             raise
-        self.path, self.problems = bag.path, bag.problems
+        self.path, self.problems, self.first_ns = bag.path, bag.problems, bag.start_ns
+        self.contents = bag.topics
         files = bag.path.iterdir() if bag.path.is_dir() else [bag.path]
         is_first = any(suffix_of(file) == ".bag" for file in files)
         self.kind = "ROS 1 bag" if is_first else "rosbag2"
@@ -114,8 +115,16 @@ class BagSource:
                     " in, here and in others like it"
                 )
         attitudes, self._attitudes = tuple(self._attitudes), []
-        frame_id = message.header.frame_id
-        return Frame(image, stamp_ns, frame_id, number, self._camera, attitudes, self._exposure_s)
+        return Frame(
+            image,
+            stamp_ns,
+            message.header.frame_id,
+            number,
+            self._camera,
+            attitudes,
+            self._exposure_s,
+            str(message.encoding if hasattr(message, "encoding") else message.format).strip(),
+        )
 
 
 def _choose(bag: Bag, topic: str | None) -> str:
@@ -124,11 +133,12 @@ def _choose(bag: Bag, topic: str | None) -> str:
     listing = ", ".join(f"{name} ({count})" for name, count in images.items())
     if not any(images.values()):
         others = ", ".join(f"{n} ({about.msgtype})" for n, about in bag.topics.items())
-        raise RecordingError(f"{bag.path} holds no images; its topics are {others}")
+        raise TopicError(f"{bag.path} holds no images; its topics are {others}", bag.topics)
     if topic is None:
         filled = [name for name, count in images.items() if count]
         if len(filled) > 1:
-            raise RecordingError(f"{bag.path} has several image topics; choose one of {listing}")
+            words = f"{bag.path} has several image topics; choose one of {listing}"
+            raise TopicError(words, bag.topics)
         return filled[0]
     name = topic if topic in bag.topics else f"/{topic}"
     if name not in images:

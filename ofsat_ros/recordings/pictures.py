@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 from ofsat_ros.images import EncodingError, decode_compressed, luminance
-from ofsat_ros.recordings.bag import RecordingError
-from ofsat_ros.recordings.recording import FRAME_ID, Attitude, Frame, Skipped
-from ofsat_ros.recordings.timing import NS, Shot, in_order
+from ofsat_ros.recordings.bag import RecordingError, Topic
+from ofsat_ros.recordings.recording import FRAME_ID, Attitude, Frame, Skipped, for_opencv
+from ofsat_ros.recordings.timing import NS, Hints, Shot, in_order, utc_ns
 
 _KINDS = {
     **{".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF"},
@@ -28,7 +28,7 @@ SUFFIXES = tuple(_KINDS)
 _ORIGINAL, _FRACTION, _OFFSET, _EXPOSURE = 0x9003, 0x9291, 0x9011, 0x829A
 _EXIF = 0x8769
 _TIME = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)")
-_ZONE = re.compile(r"([+-])(\d\d):(\d\d)")
+_ZONE = re.compile(r"[+-]\d\d:\d\d")
 _SELF_CHECKING = (b"\x89PNG", b"\xff\xd8\xff")
 
 
@@ -40,28 +40,26 @@ class PictureSource:
     path : Path
         Where they are, for messages.
     files : list of Path
-    fps, exposure_s
-        As in `open_recording`.
+    hints : Hints
     """
 
     kind = "images"
     topic = camera_info_topic = attitude_topic = ""
     last_attitudes: tuple[Attitude, ...] = ()
 
-    def __init__(
-        self, path: Path, files: list[Path], fps: float | None, exposure_s: float | None
-    ) -> None:
+    def __init__(self, path: Path, files: list[Path], hints: Hints) -> None:
         self.path = path
         self.topics: dict[str, int] = {}
+        self.contents: dict[str, Topic] = {}
         self.problems: list[str] = []
         files = self._of_one_kind(files)
-        shots = [self._look(file, exposure_s) for file in files]
-        if not fps and not _has_pillow():
+        shots = [shot for file in files for shot in self._look(file, hints.exposure_s)]
+        if not hints.fps and not _has_pillow():
             raise RecordingError(
                 f"{path}: give the rate of the pictures, as in --fps 2, or, for their own times,"
                 " pip install 'ofsat_ros[exif]' (on Debian and Ubuntu apt install python3-pil)"
             )
-        self._shots, odd = in_order(shots, path, fps)
+        self._shots, odd = in_order(shots, path, hints)
         self.problems += odd
         self.count = len(self._shots)
 
@@ -76,7 +74,7 @@ class PictureSource:
                 yield Skipped(name, shot.reason)
                 continue
             try:
-                image = _decoded(shot.file)
+                image = _decoded(shot.file, *shot.place)
             except (OSError, EncodingError) as error:
                 yield Skipped(name, f"{error}")
                 continue
@@ -91,7 +89,14 @@ class PictureSource:
             self.problems.append(f"of the {count} {most} and {words} files, only {most} are read")
         return [file for file in files if _KINDS[file.suffix.lower()] == most]
 
-    def _look(self, file: Path, exposure_s: float | None) -> Shot:
+    def _look(self, file: Path, exposure_s: float | None) -> list[Shot]:
+        """Return the pictures of a file: of TIFF, there may be several."""
+        pages = _pages(file)
+        if pages > 1:
+            return [Shot(file, (page,), exposure_s=exposure_s) for page in range(pages)]
+        return [self._look_at_tags(file, exposure_s)]
+
+    def _look_at_tags(self, file: Path, exposure_s: float | None) -> Shot:
         tags = _exif(file)
         found = _TIME.match(str(tags.get(_ORIGINAL, "")))
         own_s = float(tags.get(_EXPOSURE, 0) or 0)
@@ -99,16 +104,13 @@ class PictureSource:
         if not found:
             return Shot(file, exposure_s=exposure_s)
         digits = re.match(r"\d{1,9}", str(tags.get(_FRACTION, "")))
+        zone = _ZONE.match(str(tags.get(_OFFSET, "")))
         text = "{}-{}-{}T{}".format(*found.groups()) + (f".{digits[0]}" if digits else "")
         try:
-            stamp_ns = int(np.datetime64(text, "ns").astype(np.int64))
+            stamp_ns = utc_ns(text + (zone[0] if zone else ""))
         except ValueError:
             return Shot(file, exposure_s=exposure_s)
-        zone = _ZONE.match(str(tags.get(_OFFSET, "")))
-        if zone:
-            sign, hours, minutes = zone.groups()
-            stamp_ns -= int(f"{sign}1") * (int(hours) * 60 + int(minutes)) * 60 * NS
-        else:
+        if not zone:
             self._say_once(
                 "the pictures do not tell their time zone: their times are taken as UTC"
             )
@@ -123,7 +125,9 @@ class PictureSource:
             self.problems.append(words)
 
 
-def _decoded(file: Path) -> np.ndarray:
+def _decoded(file: Path, page: int = 0) -> np.ndarray:
+    if page:
+        return _page(file, page)
     data = file.read_bytes()
     if data.startswith(_SELF_CHECKING):
         return decode_compressed(data, file.suffix)
@@ -135,6 +139,31 @@ def _decoded(file: Path) -> np.ndarray:
         raise EncodingError(f"it cannot be decoded: {error}") from error
     if image is None:
         raise EncodingError("it is damaged, cut short, or no picture that OpenCV reads")
+    return _as_luminance(image)
+
+
+def _page(file: Path, page: int) -> np.ndarray:
+    try:
+        done, images = cv2.imreadmulti(f"{file}", page, 1, flags=cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise EncodingError(f"it cannot be decoded: {error}") from error
+    if not (done and images):
+        raise EncodingError("it is damaged, or cut short")
+    return _as_luminance(images[0])
+
+
+def _pages(file: Path) -> int:
+    """Return how many pictures a TIFF file has; 1 if it is another one, or damaged."""
+    if _KINDS[file.suffix.lower()] != "TIFF":
+        return 1
+    for_opencv(file)
+    try:
+        return max(cv2.imcount(f"{file}"), 1)
+    except cv2.error:
+        return 1
+
+
+def _as_luminance(image: np.ndarray) -> np.ndarray:
     if image.dtype not in (np.uint8, np.uint16, np.float32):
         image = image.astype(np.float32)
     return luminance(image)

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ofsat_ros.camera import Camera
-from ofsat_ros.recordings.bag import RecordingError
+from ofsat_ros.recordings.bag import RecordingError, Topic
 
 # Of images that come with none: as a camera driver's would be called.
 FRAME_ID = "camera_optical_frame"
@@ -29,6 +29,21 @@ _AHEAD = 2
 
 # A stamp, ns UTC, and the rotation from ICRS to the optical frame then.
 Attitude = tuple[int, Rotation]
+
+
+def for_opencv(file: Path) -> None:
+    """Refuse a name that is no Unicode: OpenCV ends the process on such a one.
+
+    Raises
+    ------
+    RecordingError
+    """
+    try:
+        f"{file}".encode()
+    except UnicodeEncodeError as error:
+        raise RecordingError(
+            f"{file}: OpenCV cannot open a file whose path is no Unicode: rename it"
+        ) from error
 
 
 @dataclass(frozen=True)
@@ -52,6 +67,8 @@ class Frame:
         Those recorded since the frame before; at its stamp, if its header has one.
     exposure_s : float or None
         Length of the exposure, s; None if it is not known.
+    encoding : str
+        As the message has it; empty if it is of no bag.
     """
 
     image: np.ndarray
@@ -61,6 +78,7 @@ class Frame:
     camera: Camera | None = None
     attitudes: tuple[Attitude, ...] = ()
     exposure_s: float | None = None
+    encoding: str = ""
 
 
 @dataclass(frozen=True)
@@ -81,20 +99,22 @@ class Source(Protocol):
         As in `Recording`.
     count : int
         Frames that the file's index tells of.
-    topics, topic, camera_info_topic, attitude_topic
+    contents, topics, topic, camera_info_topic, attitude_topic
         As in `Recording`.
-    problems : list of str
-        What was odd at opening.
     """
 
     path: Path
     kind: str
     count: int
+    contents: dict[str, Topic]
     topics: dict[str, int]
     topic: str
     camera_info_topic: str
     attitude_topic: str
-    problems: list[str]
+
+    @property
+    def problems(self) -> list[str]:
+        """What was odd at opening, and what turned out to be while reading."""
 
     @property
     def last_attitudes(self) -> tuple[Attitude, ...]:
@@ -128,12 +148,15 @@ class Recording:
     Attributes
     ----------
     path : Path
+        Of several, the folder that they are in.
     kind : str
         ``rosbag2``, ``ROS 1 bag``, ``FITS``, ``SER``, ``video`` or ``images``.
     topic : str
         The topic read; empty if the recording is no bag.
     camera_info_topic, attitude_topic : str
         Those read with it; empty if there is none.
+    contents : dict of str to Topic
+        All topics of the recording; empty if it is no bag.
     topics : dict of str to int
         Image topics of the recording and their counts of frames; empty if it is no bag.
     skipped : int
@@ -144,13 +167,13 @@ class Recording:
         Time that the last iteration's reading and decoding took, in its own thread, s.
     """
 
-    def __init__(self, source: Source, thread: ThreadPoolExecutor) -> None:
-        self._source = source
+    def __init__(self, source: Source, notes: list[str], thread: ThreadPoolExecutor) -> None:
+        self._source, self._notes = source, notes
         # All that the source does is done in this one thread, which SQLite may ask for.
         self._thread: ThreadPoolExecutor | None = thread
         self._coming: deque[Future[Frame | None]] = deque()
         self.path, self.kind, self.topics = source.path, source.kind, source.topics
-        self.topic = source.topic
+        self.contents, self.topic = source.contents, source.topic
         self.camera_info_topic = source.camera_info_topic
         self.attitude_topic = source.attitude_topic
         self._start_over()
@@ -181,7 +204,7 @@ class Recording:
         Why frames were skipped (the first ones), stamps that were missing, an index that does
         not agree.  Complete when the iteration has ended.
         """
-        return [*self._source.problems, *self._said]
+        return [*self._source.problems, *self._notes, *self._said]
 
     @property
     def last_attitudes(self) -> tuple[Attitude, ...]:

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from ofsat_ros.images import EncodingError, decode_image, luminance
-from ofsat_ros.recordings.bag import RecordingError
+from ofsat_ros.recordings.bag import RecordingError, Topic
 from ofsat_ros.recordings.recording import FRAME_ID, Attitude, Frame, Skipped
-from ofsat_ros.recordings.timing import LATEST_NS, NO_START, NS
+from ofsat_ros.recordings.timing import LATEST_NS, NO_START, NS, Hints
 
 SUFFIXES = (".ser",)
 MAGIC = b"LUCAM-RECORDER"
@@ -30,20 +30,29 @@ _ORDERS = {100: "rgb", 101: "bgr"}
 _TICKS_1970, _TICK_NS = 621_355_968_000_000_000, 100
 # Days of video; more is no count.
 _MOST_FRAMES = 10_000_000
+# A clock's time zone is of whole quarters of an hour; recordings begin sooner after their headers.
+_QUARTER_NS, _SOON_NS = 900 * NS, 300 * NS
 # One order of bytes makes the image so much rougher that it is the wrong one.
 _ROUGHER = 4.0
 
 
 class SerSource:
-    """A SER file as a `Source`; `fps` and `exposure_s` as in `open_recording`."""
+    """A SER file as a `Source`.
+
+    Attributes
+    ----------
+    first_ns : int
+        Stamp of its first frame.
+    """
 
     kind = "SER"
     topic = camera_info_topic = attitude_topic = ""
     last_attitudes: tuple[Attitude, ...] = ()
 
-    def __init__(self, path: Path, fps: float | None, exposure_s: float | None) -> None:
-        self.path, self._exposure_s = path, exposure_s
+    def __init__(self, path: Path, hints: Hints) -> None:
+        self.path, self._exposure_s = path, hints.exposure_s
         self.topics: dict[str, int] = {}
+        self.contents: dict[str, Topic] = {}
         self.problems: list[str] = []
         try:
             size = path.stat().st_size
@@ -52,7 +61,8 @@ class SerSource:
             raise RecordingError(f"cannot read {path}: {error}") from error
         try:
             self._read_header(size)
-            self._stamps = self._times(size, fps)
+            self._stamps = self._times(size, hints)
+            self.first_ns = self._stamps[0]
             self._order = self._byte_order()
         except RecordingError:
             self._file.close()
@@ -79,9 +89,8 @@ class SerSource:
         head = self._file.read(_HEADER.size)
         if len(head) < _HEADER.size or head[: len(MAGIC)] != MAGIC:
             raise RecordingError(f"{self.path} is no SER file, or cut within its header")
-        _, _, self._colour, self._flag, width, height, depth, count, *_, self._start = (
-            _HEADER.unpack(head)
-        )
+        _, _, self._colour, self._flag, width, height, depth, count, *rest = _HEADER.unpack(head)
+        self._local_ns, self._utc_ns = map(_ns, rest[-2:])
         self._bytes, planes = 1 if depth <= 8 else 2, 3 if self._colour in _ORDERS else 1
         known = self._colour in (*_SINGLE, *_ORDERS) and 0 < depth <= 16
         if not known or min(width, height) < 1 or max(width, height) > 1 << 20:
@@ -104,33 +113,58 @@ class SerSource:
         if self._colour in (16, 17, 18, 19):
             self.problems.append("its colours, cyan, yellow and magenta, are taken as brightness")
 
-    def _times(self, size: int, fps: float | None) -> list[int]:
+    def _times(self, size: int, hints: Hints) -> list[int]:
         """Return a stamp for each frame that is whole: its own, or one made from the rate."""
         own: list[int] = []
         if size >= _HEADER.size + self.count * (self._size + 8):
             self._file.seek(_HEADER.size + self.count * self._size)
             ticks = np.frombuffer(self._file.read(8 * self.count), "<i8").tolist()
             own = [_ns(each) for each in ticks]
-        told = own and all(own)
+        told, fps = own and all(own), hints.fps
+        if told:
+            own = self._in_utc(own)
         if told and (not fps or len(set(own)) == self.count):
-            self._say_of_times(own, fps)
+            self._say_of_times(own, hints)
             return own
         if not fps:
             raise RecordingError(
                 f"{self.path} has no times of its frames: give their rate, as in --fps 20"
             )
-        start_ns = (own[0] if told else 0) or _ns(self._start)
-        self.problems.append(
-            f"{self.path} has no time of its own for each frame: times count from its start, by"
-            f" --fps {fps:g}"
-            if start_ns
-            else NO_START
-        )
+        start_ns = hints.first_ns
+        if start_ns is None:
+            start_ns = self._start_ns(own[0] if told else 0, fps)
         return [start_ns + round(number * NS / fps) for number in range(self._whole)]
 
-    def _say_of_times(self, own: list[int], fps: float | None) -> None:
-        if fps:
-            self.problems.append(f"the times are those of the file, and not from --fps {fps:g}")
+    def _start_ns(self, own_ns: int, fps: float) -> int:
+        """Return what the file tells of its start; 0 if nothing."""
+        start_ns = own_ns or self._utc_ns or self._local_ns
+        words = NO_START
+        if start_ns:
+            words = (
+                f"{self.path} has no time of its own for each frame: times count from its start,"
+                f" by --fps {fps:g}"
+            )
+        if start_ns and not (own_ns or self._utc_ns):
+            words += "; it is local time, taken for UTC: --start would give it"
+        self.problems.append(words)
+        return start_ns
+
+    def _in_utc(self, own: list[int]) -> list[int]:
+        """Return the frames' times in UTC: some programs write local ones, against the format."""
+        zone_ns = self._local_ns - self._utc_ns
+        zone_ns = round(zone_ns / _QUARTER_NS) * _QUARTER_NS
+        known = self._local_ns and self._utc_ns and zone_ns
+        if not known or abs(own[0] - zone_ns - self._utc_ns) > _SOON_NS:
+            return own
+        self.problems.append(
+            f"{self.path} has its frames' times in local time, by its header {zone_ns / 3600e9:+g}"
+            " h from UTC: they are turned to UTC"
+        )
+        return [each - zone_ns for each in own]
+
+    def _say_of_times(self, own: list[int], hints: Hints) -> None:
+        if hints.given:
+            self.problems.append(f"the times are those of the file, and not from {hints.given}")
         if (same := self.count - len(set(own))) > 0:
             self.problems.append(
                 f"{same} frames have the same time as another one: if the file's times are too"

@@ -6,6 +6,8 @@ by custom: EXPTIME in s, ROWORDER, BAYERPAT, three planes for three colours.
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -13,14 +15,19 @@ from scipy.spatial.transform import Rotation
 
 from ofsat_ros.camera import Camera
 from ofsat_ros.images import EncodingError
-from ofsat_ros.recordings.bag import RecordingError
+from ofsat_ros.recordings.bag import RecordingError, Topic
 from ofsat_ros.recordings.fits.files import FitsFile, Picture, image_of
 from ofsat_ros.recordings.fits.times import exposure, step_s
 from ofsat_ros.recordings.fits.wcs import sky_map
 from ofsat_ros.recordings.recording import FRAME_ID, Attitude, Frame, Skipped
-from ofsat_ros.recordings.timing import Shot, in_order
+from ofsat_ros.recordings.timing import Hints, Shot, in_order
 
 __all__ = ["MAGIC", "SUFFIXES", "FitsSource"]
+
+# Which say what a picture is for.
+_TYPES = ("IMAGETYP", "FRAMETYP", "FRAME", "OBSTYPE", "IMGTYPE")
+_STACKS = ("STACKCNT", "NCOMBINE")
+_NO_SKY = re.compile("dark|bias|flat|^zero|^offset")
 
 _PLAIN = (".fits", ".fit", ".fts", ".fz")
 MAGIC = b"SIMPLE  ="
@@ -37,32 +44,25 @@ class FitsSource:
     files : list of Path
     topic : str or None
         EXTNAME of the images to read, if a file has images of several names.
-    fps, exposure_s
-        As in `open_recording`.
+    hints : Hints
     """
 
     kind = "FITS"
     camera_info_topic = attitude_topic = ""
     last_attitudes: tuple[Attitude, ...] = ()
 
-    def __init__(
-        self,
-        path: Path,
-        files: list[Path],
-        topic: str | None,
-        fps: float | None,
-        exposure_s: float | None,
-    ) -> None:
+    def __init__(self, path: Path, files: list[Path], topic: str | None, hints: Hints) -> None:
         _need_astropy(path)
         self.path = path
-        look = _Look(topic, fps, exposure_s)
-        shots = [shot for file in files for shot in look.at(file)]
+        look = _Look(topic, hints)
+        shots = look.without_calibration([shot for file in files for shot in look.at(file)])
         if not shots:
             raise RecordingError(
                 f"{path} holds no images, only tables or empty headers, or is cut short"
             )
-        self._shots, odd = in_order(shots, path, fps)
+        self._shots, odd = in_order(shots, path, hints, look.uses_rate)
         self.topics, self.topic, self.count = look.topics, look.topic, len(self._shots)
+        self.contents: dict[str, Topic] = {}
         self.problems = [*look.notes, *odd]
         self._turned = bool(look.turned_by)
         if self._turned:
@@ -149,12 +149,16 @@ class _Look:
         What says that the first row is the bottom one; empty if nothing does.
     notes : list of str
         What was assumed.
+    uses_rate : bool
+        Whether the user's rate is that of the images of a cube.
     """
 
-    def __init__(self, topic: str | None, fps: float | None, exposure_s: float | None) -> None:
-        self._wanted, self._fps, self._exposure_s = topic, fps, exposure_s
+    def __init__(self, topic: str | None, hints: Hints) -> None:
+        self._wanted, self._hints = topic, hints
+        self._types: dict[Path, str] = {}  # of files that show no sky, or several frames of it
         self.topics: dict[str, int] = {}
         self.topic = self.turned_by = ""
+        self.uses_rate = False
         self.notes: list[str] = []
         self._has_wcs = False
 
@@ -167,6 +171,20 @@ class _Look:
         with file:
             pictures = self._chosen(path, list(file.pictures.values()))
             return [shot for picture in pictures for shot in self._shots(path, picture)]
+
+    def without_calibration(self, shots: list[Shot]) -> list[Shot]:
+        """Leave out darks and their like, unless there is nothing else."""
+        frames = [shot for shot in shots if shot.file not in self._types]
+        if all(shot.reason for shot in frames):
+            return shots
+        if len(frames) < len(shots):
+            counts = Counter(self._types.values())
+            listing = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+            self.notes.append(
+                f"left out, as by their headers they are no single frames of the sky: {listing}"
+                f" ({'first' if len(self._types) > 1 else 'it is'} {next(iter(self._types)).name})"
+            )
+        return frames
 
     def _chosen(self, path: Path, pictures: list[Picture]) -> list[Picture]:
         """Return the images of one camera: in a file with several, those of the same name."""
@@ -190,11 +208,14 @@ class _Look:
 
     def _shots(self, path: Path, picture: Picture) -> Iterator[Shot]:
         self._see_rows(picture)
-        when, notes = exposure(picture.cards, self._exposure_s)
+        if kind := _no_sky(picture):
+            self._types[path] = kind
+        when, notes = exposure(picture.cards, self._hints.exposure_s)
         apart_s: float | None = 0.0
         if picture.planes > 1:
-            apart_s, assumed = step_s(picture.cards, self._fps, when.seconds)
+            apart_s, assumed = step_s(picture.cards, self._hints.fps, when.seconds)
             notes += [assumed] if assumed else []
+            self.uses_rate |= bool(self._hints.fps)
         self.notes += [note for note in notes if note not in self.notes]
         for plane in range(picture.planes):
             stamp_ns = when.stamp_ns if picture.planes == 1 else None
@@ -217,6 +238,15 @@ class _Look:
             self.turned_by = "their WCS" if sky.is_mirrored else ""
         elif str(picture.cards.get("ROWORDER", "")).upper().startswith("BOTTOM"):
             self.turned_by = "ROWORDER"
+
+
+def _no_sky(picture: Picture) -> str:
+    """Return what a picture is if it is no single frame of the sky; empty if it is."""
+    kinds = (str(picture.cards.get(name, "")).strip() for name in _TYPES)
+    if kind := next((kind for kind in kinds if _NO_SKY.search(kind.lower())), ""):
+        return kind
+    counts = (picture.cards.get(name) for name in _STACKS)
+    return "stack" if any(isinstance(count, int) and count > 1 for count in counts) else ""
 
 
 def _need_astropy(path: Path) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import zlib
-from collections.abc import Mapping
+from collections import ChainMap
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
@@ -12,12 +13,39 @@ import numpy as np
 
 from ofsat_ros.images import decode_image, luminance
 from ofsat_ros.recordings.bag import RecordingError
-from ofsat_ros.recordings.fits.times import OBS_COMMENT
 from ofsat_ros.recordings.fits.warning import silence
 
 _BAYER = ("RGGB", "BGGR", "GBRG", "GRBG")
 _MOST_PLANES = 1_000_000
 _GZIP = b"\x1f\x8b"
+
+
+class Cards(Mapping[str, Any]):
+    """A header's cards by their names; those that cannot be understood are not there.
+
+    Each is looked at when it is asked for: most of a header's many are not.  Under a name with a
+    slash behind it, as in ``DATE-OBS/``, stands the card's comment.
+    """
+
+    def __init__(self, header: Any) -> None:
+        self._header = header
+
+    def __getitem__(self, name: str) -> Any:
+        keyword = name.removesuffix("/")
+        try:
+            values = self._header.comments if keyword != name else self._header
+            value = values[keyword]
+        except Exception as error:  # the library's own errors, and others'
+            raise KeyError(name) from error
+        if type(value).__name__ == "Undefined":  # a card without a value
+            raise KeyError(name)
+        return value
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(dict.fromkeys(self._header))
+
+    def __len__(self) -> int:
+        return len(dict.fromkeys(self._header))
 
 
 class Picture:
@@ -29,9 +57,9 @@ class Picture:
         Which HDU.
     name : str
         EXTNAME; empty if there is none.
-    own : dict
+    own : Cards
         Its own cards.
-    cards : dict
+    cards : Mapping
         Its own cards, and where it has none, the primary HDU's.
     planes : int
         Images in it.
@@ -41,8 +69,11 @@ class Picture:
 
     def __init__(self, index: int, hdu: Any, primary: Any, size: int) -> None:
         self.index, self._hdu = index, hdu
-        self.own = _plain(hdu.header)
-        self.cards = {**_plain(primary), **self.own} if index else self.own
+        self.own = Cards(hdu.header)
+        self.cards: Mapping[str, Any] = self.own
+        if index:
+            # A chain may be written to, which nobody does.
+            self.cards = ChainMap(self.own, Cards(primary))  # type: ignore[arg-type]
         name = str(self.own.get("EXTNAME", "")).strip()
         # What compressing software calls an image that has no name.
         self.name = "" if name == "COMPRESSED_IMAGE" else name
@@ -115,6 +146,8 @@ class FitsFile:
                 }
         except Exception as error:  # see Picture.pixels
             self.close()
+            if isinstance(error, OSError) and error.errno:
+                raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
             raise RecordingError(f"{path} is no whole FITS file: {_words(error)}") from error
 
     def __enter__(self) -> Self:
@@ -165,19 +198,6 @@ def _demosaiced(mosaic: np.ndarray, pattern: str) -> np.ndarray:
     pixels = np.ascontiguousarray(mosaic, mosaic.dtype.newbyteorder("<"))
     name = f"bayer_{pattern.lower()}{8 * size}"
     return decode_image(pixels.reshape(-1).view(np.uint8), name, width, height, size * width, 0)
-
-
-def _plain(header: Any) -> dict[str, Any]:
-    """Return a header's cards; those that cannot be understood are left out."""
-    cards = {}
-    for card in header.cards:
-        try:
-            cards[card.keyword] = card.value
-            if card.keyword == "DATE-OBS":
-                cards[OBS_COMMENT] = card.comment
-        except Exception:  # noqa: BLE001 (the library's own errors, and others')
-            continue
-    return cards
 
 
 def _is_picture(hdu: Any) -> bool:

@@ -9,17 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from ofsat_ros.recordings.timing import LATEST_NS, NS
+from ofsat_ros.recordings.timing import NS, utc_ns
 
 # In the order in which they are asked; EXPTIME is what nearly all software writes.
-_EXPOSURES = ("EXPTIME", "EXPOSURE", "XPOSURE", "TELAPSE", "EXP_TIME", "ITIME")
+_EXPOSURES = ("EXPTIME", "EXPOSURE", "XPOSURE", "TELAPSE", "EXP_TIME", "ITIME", "EXPOINUS")
+# By their comments some are not in s; EXPOINUS is in us by its name.
+_UNITS = {r"\b(ms|msec|milli\w+)\b": 1e-3, r"\b(us|usec|\u00b5s|micro\w+)\b": 1e-6}
 _CLOCKS = ("TIME-OBS", "UTSTART", "UTC-OBS", "UT-OBS", "UTC", "UT")
 _DATE = re.compile(r"\d{4}-\d\d-\d\d")
 _OLD_DATE = re.compile(r"(\d\d)/(\d\d)/(\d\d)")
 _CLOCK = re.compile(r"\d\d:\d\d(:\d\d(\.\d*)?)?")
-# Under which the comment of DATE-OBS stands among the cards.
-OBS_COMMENT = "DATE-OBS/"
 _UTC = ("", "UTC", "UT", "UT1", "GMT", "Z")
+_LOCAL = ("LOCAL", "LT", "LCT", "LMT")
+_SHIFT = "shift it with --stamp-offset-s (-3600 where clocks are an hour ahead of UTC)"
+# What tells of the same instant may differ by so much: rounding, and begin or middle of it.
+_ALIKE_NS = 600 * NS
 _SCALES = {"ET": "tt", "TDT": "tt", "IAT": "tai"}
 _MJD_1970 = 40587
 _JD_MJD = 2400000.5
@@ -79,8 +83,14 @@ def exposure(cards: Mapping[str, Any], exposure_s: float | None) -> tuple[Exposu
         Length of the exposure, where the header has none.
     """
     notes: list[str] = []
-    seconds = next((s for s in map(_positive, _values(cards, _EXPOSURES)) if s), exposure_s)
+    seconds = next(_seconds(cards), exposure_s)
     scale = str(cards.get("TIMESYS", "")).strip().upper()
+    comment = str(cards.get("DATE-OBS/", ""))
+    if scale in _LOCAL or (
+        re.search(r"\blocal\b", comment, re.I) and not re.search(r"\bUTC?\b|\bGMT\b", comment)
+    ):
+        notes.append(f"by the headers DATE-OBS is local time; it is taken for UTC: {_SHIFT}")
+        scale = ""
     meaning = _meaning(cards)
     parts = {"beg": ["BEG"], "avg": ["AVG"], "end": ["END"]}
     parts[meaning].append("OBS")
@@ -97,6 +107,7 @@ def exposure(cards: Mapping[str, Any], exposure_s: float | None) -> tuple[Exposu
                 break
             except ValueError as error:
                 notes.append(f"a header's time makes no sense: {error}")
+    notes += _contradiction(cards, found.get("avg", found.get(meaning)), scale, seconds)
     when = Exposure(found.get("beg"), found.get("avg"), found.get("end"), seconds)
     if scale == "UT1":
         notes.append("times in UT1 are taken for UTC; they differ by less than 0.9 s")
@@ -132,9 +143,41 @@ def step_s(
     )
 
 
+def _seconds(cards: Mapping[str, Any]) -> Iterator[float]:
+    """Yield what the header tells of the exposure's length, s, the best first."""
+    for name in _EXPOSURES:
+        value = _positive(cards.get(name))
+        comment = "us" if name == "EXPOINUS" else str(cards.get(f"{name}/", "")).lower()
+        for pattern, unit in _UNITS.items():
+            value = value * unit if value and re.search(pattern, comment) else value
+        if value:
+            yield value
+
+
+def _contradiction(
+    cards: Mapping[str, Any], used_ns: int | None, scale: str, seconds: float | None
+) -> list[str]:
+    """Say so if the header's times are apart by what could be a time zone."""
+    for name in ("DATE-OBS", "MJD-OBS", "JD", "DATE-AVG"):
+        part = name.partition("-")[2] or "OBS"
+        told = [text for text in _instants({name: cards.get(name, "")}, part) if "T" in text]
+        try:
+            away_ns = used_ns - _ns(told[0], scale) if told and used_ns is not None else 0
+        except ValueError:
+            continue
+        if abs(away_ns) > _ALIKE_NS + (seconds or 0) * NS:
+            away_s = 900 * round(away_ns / (900 * NS))
+            apart = f"{abs(away_s) / 3600:g} h {'later' if away_ns > 0 else 'earlier'}"
+            return [
+                f"the headers contradict themselves: the time that is used is {apart} than {name};"
+                f" if it is local time, shift it with --stamp-offset-s {-away_s}"
+            ]
+    return []
+
+
 def _meaning(cards: Mapping[str, Any]) -> str:
     """Return what DATE-OBS tells: the standard's begin, unless its comment says otherwise."""
-    comment = str(cards.get(OBS_COMMENT, "")).lower()
+    comment = str(cards.get("DATE-OBS/", "")).lower()
     if re.search(r"start|begin", comment):
         return "beg"
     if re.search(r"\bmid|\bcent(er|re)\b", comment):
@@ -149,10 +192,10 @@ def _instants(cards: Mapping[str, Any], name: str) -> Iterator[str]:
         day, month, year = old.groups()
         text = f"19{year}-{month}-{day}"
     if _DATE.fullmatch(text):
-        clocks = [str(each).strip() for each in _values(cards, _CLOCKS)]
+        clocks = [str(cards.get(name, "")).strip() for name in _CLOCKS]
         text = next((f"{text}T{each}" for each in clocks if _CLOCK.fullmatch(each)), "")
     if text:
-        yield text.replace(" ", "T").removesuffix("Z")
+        yield text.replace(" ", "T")
     days = _positive(cards.get(f"MJD-{name}"))
     julian = _positive(cards.get("JD")) if name == "OBS" else None
     if days is None and julian is not None:
@@ -165,16 +208,13 @@ def _instants(cards: Mapping[str, Any], name: str) -> Iterator[str]:
 
 def _ns(text: str, scale: str) -> int:
     """Return ns UTC of an ISO 8601 time in a time scale."""
+    if scale in _UTC:
+        return utc_ns(text)
+    text = text.removesuffix("Z")
     date, _, clock = text.partition("T")
     if not (_DATE.fullmatch(date) and _CLOCK.fullmatch(clock)):
         raise ValueError(f"{text!r} is no date and time")
-    if scale not in _UTC:
-        text = _to_utc(text, scale)
-    if not "1970" <= text[:4] < "2106":  # beyond, a stamp cannot hold it
-        raise ValueError(f"{text} is not within the years 1970 to 2105")
-    ns = int(np.datetime64(text, "ns").astype(np.int64))
-    assert 0 <= ns < LATEST_NS
-    return ns
+    return utc_ns(_to_utc(text, scale))
 
 
 def _to_utc(text: str, scale: str) -> str:
@@ -188,10 +228,6 @@ def _to_utc(text: str, scale: str) -> str:
         return str(Time(time.utc, precision=9).isot)
     except Exception as error:  # the library's own errors, and those of erfa below it
         raise ValueError(f"TIMESYS is {scale!r}: {error}") from error
-
-
-def _values(cards: Mapping[str, Any], names: tuple[str, ...]) -> Iterator[Any]:
-    return (cards[name] for name in names if name in cards)
 
 
 def _positive(value: Any) -> float | None:

@@ -56,7 +56,7 @@ class SkyMap:
         from astropy.io.fits import Header
         from astropy.wcs import WCS
 
-        own = {name: value for name, value in cards.items() if _CARDS.fullmatch(name)}
+        own = {name: cards[name] for name in cards if _CARDS.fullmatch(name) and name in cards}
         for name, value in own.items():  # the library takes text for 0
             if not (_TEXT.match(name) or isinstance(value, int | float)):
                 raise CameraError(f"{name} is {value!r}, and not a number")
