@@ -22,7 +22,7 @@ endif
 
 .PHONY: help
 help:
-	$(say) 'make demo   replay a sample bag to the detector over DDS; results in demo_output/'
+	$(say) 'make demo   replay a sample bag to the detector over DDS; results in demo_output/, a page in demo_report/'
 	$(say) 'make demo-guide  a simulated mount follows a satellite; results in demo_guide_output/'
 	$(say) 'make test   run all tests'
 	$(say) 'make lint   check format, style and types'
@@ -33,6 +33,8 @@ help:
 demo: $(STAMP)
 	$(say) 'demo: player -> detector -> recorder; results go to demo_output/'
 	@$(BIN)/demo --output demo_output
+	$(say) 'demo: the same bag without ROS, with a page on what was found: demo_report/report.html'
+	@$(BIN)/ofsat process bags/geo -o demo_report --force
 
 .PHONY: demo-guide
 demo-guide: $(STAMP)
@@ -68,7 +70,7 @@ bench: $(STAMP)
 .PHONY: clean
 clean:
 	$(say) 'clean: .venv, demo outputs, build, install, log and caches'
-	@rm -rf $(VENV) demo_output demo_guide_output build install log .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	@rm -rf $(VENV) demo_output demo_report demo_guide_output build install log .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	@rm -rf *.egg-info
 	@find . -name __pycache__ -prune -exec rm -rf {} +
 
