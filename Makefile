@@ -61,6 +61,8 @@ bench: $(STAMP)
 	@$(BIN)/python -m benchmarks.paper
 	$(say) 'bench: detection beside the published method and SExtractor'
 	@$(BIN)/python -m benchmarks.detection
+	$(say) 'bench: parameters for unusual optics'
+	@$(BIN)/python -m benchmarks.optics
 	$(say) 'bench: speed against SExtractor, and throughput over DDS'
 	@$(BIN)/python -m benchmarks.speed
 	@$(BIN)/python -m benchmarks.throughput

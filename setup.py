@@ -24,23 +24,25 @@ ROS = [
     *OPENCV,
 ]
 LINT = ["mypy>=2.4,<3", "ruff>=0.17,<0.18", "types-PyYAML", "types-tqdm"]
-SKY = ["astropy"]
+SKY = ["astropy>=5.3"]  # the first that reads parts of compressed images
 PLOT = ["matplotlib"]
+REPORT = ["av", "jinja2", "pillow"]
 BENCH = ["sgp4", *PLOT, *SKY]
 TEST = [
     "colcon-core",
     "colcon-ros",
     "hypothesis",
+    "mcap",  # writes what we read
     "pytest>=9",
     "sep",
-    *(*SKY, *PLOT, "sgp4"),
+    *(*SKY, *PLOT, *REPORT, "sgp4"),
     *("ccsds-ndm", "lxml"),  # reads back what we write; GPL, so for tests only
     "setuptools>=70.1,<80",  # the range in which colcon and pip can both build with it
 ]
 
 SAMPLE_BAG = "bags/survey_png"  # the smallest
 NODES = (
-    *("detector", "player", "simulator", "recorder", "guide", "tdm_writer"),
+    *("detector", "player", "simulator", "recorder", "guide", "tdm_writer", "watch"),
     *("demo", "demo_guide"),
 )
 
@@ -53,7 +55,7 @@ setup(
     license="Apache-2.0",
     python_requires=">=3.11",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["presets/*.yaml", "data/*"]},
+    package_data={NAME: ["presets/*.yaml", "data/*", "report/page/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
@@ -64,16 +66,22 @@ setup(
         (f"share/{NAME}/config", sorted(glob(f"{NAME}/presets/*.yaml") + glob(f"{NAME}/data/*"))),
     ],
     zip_safe=False,
-    install_requires=["click", "numpy>=1.26", "PyYAML", "rosbags>=0.11", "scipy>=1.11", "tqdm"],
+    install_requires=[
+        *("click", "numpy>=1.26", "PyYAML", "rosbags>=0.11.9", "scipy>=1.11", "tqdm"),
+        'backports.zstd; python_version < "3.14"',  # as rosbags has it
+    ],
     extras_require={
         "ros": ROS,
         "opencv": OPENCV,
         "sky": SKY,
         "plot": PLOT,
+        "fits": SKY,
+        "exif": ["pillow"],
+        "report": REPORT,
         "lint": LINT,
         "test": TEST,
         "bench": BENCH,
-        "all": [*ROS, *SKY, *PLOT, *LINT, *TEST, *BENCH],
+        "all": [*ROS, *SKY, *PLOT, *REPORT, *LINT, *TEST, *BENCH],
     },
     entry_points={
         "console_scripts": [

@@ -21,12 +21,15 @@ from tqdm import tqdm
 from ofsat_ros.camera import Astrometry, Camera
 from ofsat_ros.pipeline import FrameResult, ImageError, Pipeline
 from ofsat_ros.recordings import Attitude, Frame, Recording
-from ofsat_ros.results import ResultWriter, in_words
+from ofsat_ros.results import STAR_FIELD, ResultWriter, in_words
 from ofsat_ros.results.bag import ResultBag
 from ofsat_ros.tracking import Settled
 from ofsat_ros.tracking_data import TrackArcs
 
 Detections = NDArray[np.void]
+
+# Of a camera that stamps badly, each frame may start afresh.
+_RESETS_TOLD = 5
 
 
 class Totals:
@@ -34,15 +37,15 @@ class Totals:
 
     def __init__(self) -> None:
         self.frames = self.left_out = 0
-        self.width: int | None = None
-        self.height: int | None = None
         self.first_stamp_ns: int | None = None  # middle of the exposure, as in all files
         self.last_stamp_ns: int | None = None
         self.problems: list[str] = []
         self.detections: Counter[int] = Counter()  # by track; 0 stands for candidates
         self.unlocated: Counter[str] = Counter()  # detections without direction, by the reason
+        self.resets = 0  # after the first frame
         self.reason = ""
         self.reading_s = 0.0  # in its own thread, beside all others
+        self._sizes: Counter[tuple[int, int]] = Counter()  # of the images: height, width
         self._seconds: dict[str, float] = defaultdict(float)  # none overlap
 
     @contextmanager
@@ -61,17 +64,20 @@ class Totals:
         """Count a frame."""
         self.frames += 1
         self.reason = result.reason
-        self.height, self.width = result.shape
+        self._sizes[result.shape] += 1
         self.last_stamp_ns = result.stamp_ns
         if self.first_stamp_ns is None:
             self.first_stamp_ns = result.stamp_ns
 
     def as_dict(self) -> dict[str, Any]:
         """Return what ``run.json`` says of them."""
-        same = ("frames", "left_out", "width", "height", "first_stamp_ns", "last_stamp_ns")
+        same = ("frames", "left_out", "first_stamp_ns", "last_stamp_ns")
         candidates = self.detections[0]
+        # Of most frames, should they differ.
+        height, width = self._sizes.most_common(1)[0][0] if self._sizes else (None, None)
         return {
             **{name: getattr(self, name) for name in same},
+            **{"width": width, "height": height},
             "detections": self.detections.total() - candidates,
             "candidates": candidates,
             "tracks": sum(1 for track_id in self.detections if track_id),
@@ -92,7 +98,7 @@ class Totals:
         return "\n".join(lines)
 
     def __str__(self) -> str:
-        words = f"{in_words(self.detections)} in {self.frames} frames"
+        words = f"{in_words(self.detections)} in {self.frames} frame{'s' * (self.frames != 1)}"
         if self.left_out:
             words += f" ({self.left_out} more could not be processed)"
         if not self.detections and self.reason:
@@ -188,6 +194,8 @@ class Processing:
                 self._write_settled()
             totals.reading_s = frames.seconds
             totals.left_out = self._refused + frames.skipped
+            if more := max(totals.resets - _RESETS_TOLD, 0):
+                self.note(f"{more} more frames start afresh: {STAR_FIELD} says why")
             for problem in frames.problems:
                 self.note(problem)
         # Most cameras are not calibrated, and nobody misses directions then.
@@ -217,7 +225,9 @@ class Processing:
                 self.note(f"frame {frame.number} is left out, and others like it: {error}")
             return
         if result.reset and totals.frames:
-            self.note(f"frame {frame.number} starts afresh: {result.reset}")
+            totals.resets += 1
+            if totals.resets <= _RESETS_TOLD:
+                self.note(f"frame {frame.number} starts afresh: {result.reset}")
         seen = _Seen(frame.number, frame.stamp_ns, frame.frame_id, camera, result)
         self._seen[result.frame] = seen
         with totals.timed("writing"):

@@ -29,7 +29,10 @@ ALLOWED = {
     "optical_flow": {"parameters", "pixels"},
     "star_field": {"parameters", "optical_flow"},
     "history": {"pixels", "star_field"},
-    "detection": {"parameters", "pixels", "parallel", "optical_flow", "star_field", "history"},
+    "detection": {
+        *("parameters", "pixels", "parallel"),
+        *("optical_flow", "star_field", "history"),
+    },
     "tracking": {"history", "detection"},
     "pipeline": {"parameters", "pixels", *STAGES},
     "camera": {"parameters"},
@@ -38,10 +41,13 @@ ALLOWED = {
     "tracking_data": {"parameters"},
     "recordings": {"images", "camera"},
     "simulation": {"parameters", "camera"},
-    "results": {"parameters", "pipeline", "detection", "tracking"},
+    "results": {"parameters", "pipeline", "detection", "tracking", "recordings"},
     "processing": {"camera", "pipeline", "recordings", "results", "tracking", "tracking_data"},
+    "suggestion": {"parameters", "camera", "pipeline", "recordings"},
     "evaluation": {"results"},
-    "report": {"pipeline", "detection", "tracking"},
+    "report": {
+        *("parameters", "camera", "pipeline", "detection", "tracking", "recordings", "results"),
+    },
 }
 # The two fronts use the rest, but not each other.
 ALLOWED["cli"] = ALLOWED["nodes"] = set(ALLOWED)

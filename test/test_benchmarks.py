@@ -54,6 +54,14 @@ def test_sensitivity_at_the_ends_of_its_curve():
     assert float(cells(told, "20")[1]) > 0.8
 
 
+def test_optics_of_one_row():
+    told = run("optics", "--seeds", "1", "--rows", "3", "--jobs", "1")
+    _, name, value, before, after, _ = cells(told, "FWHM 1.0 px, RSOs at rest")
+    assert (name, value) == ("`hot_pixels`", "keep")
+    # Stars that look like defects: a third of the RSOs is found, and nine tenths.
+    assert float(after) > float(before) + 0.3
+
+
 def test_the_papers_scenes():
     told = run("paper", "--frames", "8", "--brightness", "1")
     assert cells(told, "robust, sparse")[1:4] == ["5 of 5", "35 of 35", "0.00"]

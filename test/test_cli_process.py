@@ -1,10 +1,14 @@
 """The files that ``ofsat process`` makes: tables, bag, run, report, video; and what stays."""
 
 import csv
+import errno
+import html
 import json
 import math
+import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
@@ -159,9 +163,27 @@ def test_a_run_says_what_the_user_was_told(tmp_path):
     assert run["attitude_topic"] is None
 
 
+def test_a_full_disk_is_told_in_words_and_a_video_needs_no_report(bag, tmp_path, monkeypatch):
+    def refuse(folder: Path, say: object) -> Path:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def write_video(folder: Path, path: Path) -> Path:
+        path.write_text("a film")
+        return path
+
+    monkeypatch.setattr("ofsat_ros.cli.process.write_report", refuse)
+    monkeypatch.setattr("ofsat_ros.cli.process.write_video", write_video)
+    film = tmp_path / "film.mp4"
+    words = ("process", bag, "-o", tmp_path / "out", "--video", film)
+    done = CliRunner().invoke(main, [str(word) for word in words])
+    assert done.exit_code == 0
+    assert done.stderr == "note: no report is written: No space left on device\n"
+    assert film.exists()
+
+
 @pytest.mark.parametrize("error", [ModuleNotFoundError, OSError])
 def test_a_report_that_cannot_be_made_costs_nothing_but_itself(error, bag, tmp_path, monkeypatch):
-    def refuse(folder: Path) -> Path:
+    def refuse(folder: Path, say: object) -> Path:
         assert read_run(folder)["frames"] == FRAMES
         raise error("the extra ofsat_ros[report] is missing")
 
@@ -177,7 +199,7 @@ def test_a_report_that_cannot_be_made_costs_nothing_but_itself(error, bag, tmp_p
 
 
 def test_report_and_video_are_made_of_the_results(bag, tmp_path, monkeypatch):
-    def write_report(folder: Path) -> Path:
+    def write_report(folder: Path, say: object) -> Path:
         assert (folder / "tracks.csv").read_text().count("\n") > 1  # whole
         (folder / "report.html").write_text("a page")
         return folder / "report.html"
@@ -205,12 +227,37 @@ def test_report_and_video_are_made_of_the_results(bag, tmp_path, monkeypatch):
 
 
 def test_a_stop_in_the_report_leaves_the_results_whole(bag, tmp_path, monkeypatch):
-    def stopped(folder: Path) -> Path:
+    def stopped(folder: Path, say: object) -> Path:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("ofsat_ros.cli.process.write_report", stopped)
     done = ofsat("process", bag, "-o", tmp_path, "--report")
     assert (done.exit_code, done.stdout) == (130, "")
-    assert f"`ofsat report {tmp_path}` makes a page of it" in " ".join(done.stderr.split())
+    said = " ".join(done.stderr.split())
+    assert f"in {tmp_path}; `ofsat report {tmp_path}` makes a page of it" in said
+    assert "so far" not in said
     run = read_run(tmp_path)
     assert (run["stopped"], run["frames"]) == (False, FRAMES)
+
+
+def test_several_files_and_their_begin_are_in_the_run_and_on_the_page(bag, tmp_path):
+    with open_recording(bag) as recording:
+        for frame in recording:
+            cv2.imwrite(f"{tmp_path}/frame{frame.number}.png", frame.image)
+    files = [tmp_path / f"frame{number}.png" for number in range(FRAMES)]
+    times = ("--fps", 1, "--start", "2026-01-01T02:00+01:00")
+    done = ofsat("process", *reversed(files), "-o", tmp_path / "found", *times, "--report")
+    assert done.exit_code == 0, done.output
+    run = read_run(tmp_path / "found")
+    start_ns = 1_767_229_200_000_000_000
+    assert run["recording"] == [f"{file}" for file in reversed(files)]
+    assert (run["fps"], run["start_ns"], run["first_stamp_ns"]) == (1, start_ns, start_ns)
+    page = html.unescape((tmp_path / "found" / "report.html").read_text(encoding="utf-8"))
+    command = re.search(r"ofsat (process .*?)</code>", page)[1].split()
+    assert command[1 : FRAMES + 1] == run["recording"]
+    assert command[-4:] == ["--fps", "1.0", "--start", "2026-01-01T01:00:00Z"]
+    assert "No pictures" not in page
+    folder, found = tmp_path / "found", tmp_path / "again"
+    assert ofsat("process", tmp_path, "-o", found, *times).exit_code == 0
+    rows = [np.genfromtxt(f / "star_field.csv", delimiter=",")[1:, :2] for f in (folder, found)]
+    np.testing.assert_array_equal(*rows)

@@ -225,6 +225,13 @@ def test_without_a_detector_it_says_where_else_there_is_one(clock):
     assert "Tracks are on /east/rso_tracks: ofsat watch --namespace /east" in text
 
 
+def test_a_namespace_that_is_none_is_bad_usage():
+    for name in ("a b", "1st", "/a//b", "east;"):
+        done = CliRunner().invoke(main, ["watch", "--namespace", name])
+        assert done.exit_code == 2
+        assert f"'{name}' is no namespace" in " ".join(done.stderr.split())
+
+
 class Terminal:
     """Stands in for a terminal; `screen` is what it shows last."""
 

@@ -22,7 +22,7 @@ from ofsat_ros.parameters import Parameters
 ROOT = Path(__file__).parents[1]
 NODES = {
     *("demo", "demo_guide", "detector", "guide", "player", "recorder", "simulator"),
-    "tdm_writer",
+    *("tdm_writer", "watch"),
 }
 # What Python imports under another name than rosdep or pip know it by.
 ROSDEP_KEYS = {
@@ -38,7 +38,10 @@ ROSDEP_KEYS = {
 }
 PIP_NAMES = {"yaml": "PyYAML"}
 # What only some commands and tests need, and pip's extras bring: imported where it is used.
-EXTRAS = {"astropy", "ccsds_ndm", "erfa", "matplotlib", "sgp4", "xsdata"}
+EXTRAS = {
+    *("PIL", "astropy", "av", "ccsds_ndm", "erfa", "jinja2", "matplotlib", "mcap", "sgp4"),
+    "xsdata",
+}
 DEADLINE_S = 30.0
 SAMPLE_BAG = "bags/survey_png"
 
@@ -236,7 +239,7 @@ def test_pip_installs_package_data(metadata: importlib.metadata.Distribution):
 
 def test_plain_install_leaves_ros_and_opencv_alone(metadata: importlib.metadata.Distribution):
     plain = [text for text in metadata.requires or [] if "extra ==" not in text]
-    assert "rosbags>=0.11" in plain
+    assert "rosbags>=0.11.9" in plain
     assert not [text for text in plain if text.startswith(("ros-", "opencv"))]
 
 

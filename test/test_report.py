@@ -1,6 +1,8 @@
 """Annotated pictures: what is drawn, where, and in which colour."""
 
 import math
+import subprocess
+import sys
 
 import cv2
 import numpy as np
@@ -22,6 +24,17 @@ RSO_STEP = np.array([-5.0, 2.0])
 
 def dark(shape: tuple[int, int] = (HEIGHT, WIDTH), dtype: type = np.uint16) -> np.ndarray:
     return np.full(shape, 100, dtype)
+
+
+def test_pictures_of_frames_need_no_recordings_nor_results():
+    """The detector node starts without what only a report needs."""
+    loaded = "import sys, ofsat_ros.report; print(*(m for m in sys.modules if 'ofsat_ros' in m))"
+    told = subprocess.run(
+        [sys.executable, "-c", loaded], capture_output=True, text=True, check=True
+    )
+    modules = told.stdout.split()
+    assert "ofsat_ros.report.picture" in modules
+    assert not [name for name in modules if "recordings" in name or "results" in name]
 
 
 def motion(count: int) -> StarFieldMotion:

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 from browser import PROGRAM, Browser
-from command import fails, succeeds
+from command import fails, ofsat, succeeds
 
-from ofsat_ros.recordings import BagWriter
+from ofsat_ros.recordings import BagWriter, RecordingError
 from ofsat_ros.report import write_report, write_video
 from ofsat_ros.report.findings import read_findings
 from ofsat_ros.results import (
@@ -218,8 +218,11 @@ def test_what_others_wrote_is_escaped(results: Path, browser: Browser):
 
 def test_recording_that_is_gone_costs_the_pictures_only(results: Path):
     change(results, recording="/nowhere/night")
-    words = text_of(write_report(results))
+    said: list[str] = []
+    words = text_of(write_report(results, say=said.append))
     assert "No pictures: the recording is not at /nowhere/night: say where it is" in words
+    (note,) = said  # also to those who only see a terminal
+    assert note.startswith("note: report.html has no pictures: the recording is not at")
     assert "<img" not in words
     assert words.count('class="chart"') > 8
 
@@ -230,18 +233,82 @@ def test_recording_that_moved_is_found_where_one_says(results: Path, run):
 
 
 def test_another_recording_is_refused(results: Path, tmp_path: Path):
-    with BagWriter(tmp_path / "other") as bag:
-        for i in range(3):
-            bag.write_image(TOPIC, np.zeros((40, 50), np.uint16), START_NS + i, "camera")
-    words = text_of(write_report(results, tmp_path / "other"))
-    assert f"its images are 50x40, those of {results} were {WIDTH}x{HEIGHT}" in words
+    (first_ns, *_) = read_findings(results).frames["stamp_ns"].tolist()
+    page = write_report(results)
+    before = page.read_bytes()
+    for name, stamp_ns, says in (
+        ("later", first_ns + 10**9, "or was changed: its frame 0 is of 2026-01-01 00:00:02.000"),
+        ("smaller", first_ns, f"it has no images of {WIDTH}x{HEIGHT}"),
+    ):
+        with BagWriter(tmp_path / name) as bag:
+            bag.write_image(TOPIC, np.zeros((40, 50), np.uint16), stamp_ns, "camera")
+        with pytest.raises(RecordingError, match=f"{name} is another recording.*{says}"):
+            write_report(results, tmp_path / name)
+        # What is not what was asked for does not take the place of what is.
+        assert page.read_bytes() == before
+        change(results, recording=f"{tmp_path / name}")
+        assert says in fails(1, "report", results, "--video", tmp_path / "night.gif")
+        page.write_bytes(before)
+    assert not (tmp_path / "night.gif").exists()
+
+
+def processed(folder: Path, images: list[np.ndarray], step_ns: int = 10**9) -> Path:
+    """Make a recording of images, and results of it."""
+    with BagWriter(folder / "night", compression="none") as bag:
+        for i, image in enumerate(images):
+            bag.write_image(TOPIC, image, START_NS + i * step_ns, "camera")
+    succeeds("process", folder / "night", "-o", folder / "results")
+    return folder / "results"
+
+
+def images_of(name: str, seed: int, frames: int, **size: int) -> list[np.ndarray]:
+    settings = {"frames": frames, "width": 160, "height": 120} | size
+    return [frame.image for frame in scenario(name, seed, **settings)]
+
+
+def alts(words: str) -> list[str]:
+    """What the pictures of the sky are said to show."""
+    return re.findall(r'<img[^>]*? alt="((?:Deep sky|Movers|Sensor|Frame): .*?)"', words)
+
+
+def test_frames_of_another_size_are_left_out_of_the_pictures(tmp_path: Path):
+    images = images_of("geo", 3, 9)
+    images[2] = images[2][:100]  # first there are two frames, then six
+    results = processed(tmp_path, images)
+    run = read_run(results)
+    assert (run["width"], run["height"]) == (160, 120)
+    words = text_of(write_report(results))
+    assert any("the mean of 6 frames" in alt for alt in alts(words))
+    # What was before the break is not drawn on the stars after it.
+    findings = read_findings(results)
+    inside = [track for track in findings.tracks if findings.is_in_main_stretch(track)]
+    assert inside
+    assert words.count('class="mark') == len(inside) * len(alts(words))
+    if others := len(findings.tracks) - len(inside):
+        assert f"{others} RSO" in words
+
+
+def test_pixels_that_are_missing_cost_no_picture(tmp_path: Path):
+    random = np.random.default_rng(1)
+    images = [image.astype(np.float32) for image in images_of("survey", 1, 6)]
+    for image in images:
+        image[random.random(image.shape) < 0.2] = np.nan
+        image[:, -20:] = np.inf
+    words = text_of(write_report(processed(tmp_path, images)))
+    assert {alt.split(":")[0] for alt in alts(words)} >= {"Deep sky", "Movers"}
+
+
+def test_stamps_that_are_all_the_same_are_told_in_few_words(tmp_path: Path):
+    results = processed(tmp_path, images_of("empty", 1, 12), step_ns=0)
+    words = text_of(write_report(results))
+    assert words.count("starts afresh: two frames have the same stamp") == 5
+    assert "6 more frames start afresh: star_field.csv says why" in words
+    assert "<dt>between frames</dt><dd>\u2013 s</dd>" in words
+    assert alts(words) == ["Frame: a single frame: there is no other to lay on it"]
 
 
 def test_sky_without_rso_says_why(tmp_path: Path):
-    with BagWriter(tmp_path / "empty") as bag:
-        for frame in scenario("empty", 1, frames=6, width=160, height=120):
-            bag.write_image(TOPIC, frame.image, frame.stamp_ns, "camera")
-    succeeds("process", tmp_path / "empty", "-o", tmp_path / "results")
+    processed(tmp_path, images_of("empty", 1, 6))
     words = text_of(write_report(tmp_path / "results"))
     assert "<h1>No RSO in 6 frames</h1>" in words
     assert re.search(r'"lead">The last frame says: \d+ stars; .*</p>', words)
@@ -249,51 +316,42 @@ def test_sky_without_rso_says_why(tmp_path: Path):
     assert "<h2>Tracks</h2>" not in words
 
 
-def test_single_frame_says_what_is_missing(tmp_path: Path):
-    frame = next(iter(scenario("geo", 1, frames=2, width=160, height=120)))
-    with BagWriter(tmp_path / "one") as bag:
-        bag.write_image(TOPIC, frame.image, frame.stamp_ns, "camera")
-    succeeds("process", tmp_path / "one", "-o", tmp_path / "results")
-    assert "A single frame shows no motion" in text_of(write_report(tmp_path / "results"))
+@pytest.mark.parametrize(
+    ("frames", "says"),
+    [
+        (1, "A single frame shows no motion: three at least are needed"),
+        (2, "An RSO is known as such in its third frame at the earliest: there are two."),
+    ],
+)
+def test_few_frames_say_what_is_missing(tmp_path: Path, frames: int, says: str):
+    assert says in text_of(write_report(processed(tmp_path, images_of("geo", 1, frames))))
 
 
 def test_page_of_a_long_night_is_light(results: Path, tmp_path: Path):
     """500 frames full of RSOs, more than are shown one by one."""
-    frames, tracks, size = 500, 60, 240
+    frames, tracks, size = 500, 60, 160
     random = np.random.default_rng(1)
     stamps = START_NS + np.arange(frames) * 10**9
     with BagWriter(tmp_path / "night", compression="none") as bag:
         for stamp in stamps.tolist():
             image = random.integers(80, 120, (size, size), np.uint8)
             bag.write_image(TOPIC, image, stamp, "camera")
-    places = random.uniform(30, 210, (tracks, 2))
-    found = (results / "detections.csv").open("w")
-    field = (results / "star_field.csv").open("w")
-    with found, field:
-        found.write(",".join(DETECTION_COLUMNS) + "\n")
-        field.write(",".join(STAR_FIELD_COLUMNS) + "\n")
-        for frame, stamp in enumerate(stamps.tolist()):
-            field.write(
-                f"{stamp},{frame},{1.0 if frame else 'nan'},0.4,0.1,0.4,0.1,0,0,0.01,0.01,"
+    field = [",".join(STAR_FIELD_COLUMNS)]
+    found = [",".join(DETECTION_COLUMNS)]
+    places = random.uniform(30, 130, (tracks, 2))
+    for frame, stamp in enumerate(stamps.tolist()):
+        dt_s = "1" if frame else "nan"
+        field.append(
+            f"{stamp},{frame},{dt_s},0.4,0.1,0.4,0.1,0,0,0.01,0.01,0.2,300,400,60,100,4,16,"
+        )
+        numbers = random.normal([0, 0, 10, 10, 10], [0.2, 0.2, 1, 1, 1], (tracks, 5))
+        numbers[:, :2] += places
+        for track, (x, y, snr, flux, length) in enumerate(numbers.tolist(), 1):
+            found.append(
+                f"{stamp},{frame},{track},1,{x},{y},0.1,0.1,-0.3,0.01,0.2,0.2,{snr},{flux},{length},0,0,0"
             )
-            field.write('0.2,300,400,60,100,4,16,""\n')
-            for track, (x, y) in enumerate(random.normal(places, 0.2).tolist(), 1):
-                numbers = [
-                    x,
-                    y,
-                    0.1,
-                    0.1,
-                    -0.3,
-                    0.01,
-                    0.2,
-                    0.2,
-                    *random.uniform(9, 12, 3),
-                    0,
-                    0,
-                    0,
-                ]
-                found.write(f"{stamp},{frame},{track},1," + ",".join(f"{n:.9g}" for n in numbers))
-                found.write("\n")
+    (results / "star_field.csv").write_text("\n".join(field) + "\n")
+    (results / "detections.csv").write_text("\n".join(found) + "\n")
     night = f"{tmp_path / 'night'}"
     change(results, recording=night, width=size, height=size, frames=frames)
     page = write_report(results)
@@ -316,6 +374,9 @@ def test_line_that_was_cut_off_is_left_out(results: Path):
         ("star_field.csv", None, "holds no star_field.csv"),
         ("run.json", None, r"holds no run\.json"),
         ("run.json", "{", r"run\.json is damaged"),
+        ("run.json", '{"width": "200"}', r"run\.json is damaged: width is '200'"),
+        ("run.json", '{"profile": {"tracking": "1"}}', r"run\.json is damaged: profile"),
+        ("run.json", '{"recording": [1]}', r"run\.json is damaged: recording is \[1\]"),
     ],
 )
 def test_folders_that_are_no_results(results: Path, name: str, text: str | None, says: str):
@@ -323,6 +384,28 @@ def test_folders_that_are_no_results(results: Path, name: str, text: str | None,
     with pytest.raises(ResultError, match=says):
         write_report(results)
     assert not (results / "report.html").exists()
+
+
+def test_a_run_that_tells_nothing_is_enough_for_words(results: Path):
+    (results / "run.json").write_text("{}")
+    words = text_of(write_report(results))
+    assert f"RSOs in {FRAMES} frames</h1>" in words
+    assert "No pictures: the recording is not at ?" in words
+
+
+def test_times_that_make_no_sense_are_named(results: Path):
+    change(results, parameters={"stamp_offset_s": "late"})
+    with pytest.raises(ResultError, match=r"run\.json is damaged: stamp_offset_s"):
+        write_report(results)
+
+
+def test_garbage_at_the_end_of_a_table_is_left_out(results: Path):
+    before = read_findings(results)
+    with (results / "star_field.csv").open("ab") as file:
+        file.write(b"1767\xff\xfe\x00\x00")
+    after = read_findings(results)
+    np.testing.assert_array_equal(after.frames["stamp_ns"], before.frames["stamp_ns"])
+    assert after.frames["note"][-1] == before.frames["note"][-1]
 
 
 def test_a_cell_that_is_no_number_is_named(results: Path):
@@ -422,3 +505,16 @@ def test_command(results: Path, tmp_path: Path):
     assert "exists: choose another name, or --force" in refused
     assert "there is nothing at" in fails(1, "report", results, "--recording", tmp_path / "no")
     assert "holds no run.json" in fails(1, "report", tmp_path)
+
+
+def test_stopped_command_says_what_there_is(results: Path, tmp_path: Path, monkeypatch):
+    def stopped(*_: object) -> Path:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("ofsat_ros.cli.report.write_video", stopped)
+    page = results / "report.html"
+    done = ofsat("report", results, "--video", tmp_path / "night.gif")
+    assert (done.exit_code, done.stdout) == (130, "")
+    assert done.stderr == f"stopped; {page} is written\n"
+    monkeypatch.setattr("ofsat_ros.cli.report.write_report", stopped)
+    assert ofsat("report", results).stderr == "stopped; nothing is written\n"

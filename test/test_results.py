@@ -243,7 +243,10 @@ def test_a_run_is_written_and_read(tmp_path):
     run = {"recording": "/nächte/eins", "frames": 3, "topic": None, "problems": ["so"], "s": 0.1}
     results.write_run(tmp_path, {"old": True})
     results.write_run(tmp_path, run)
-    assert results.read_run(tmp_path) == run
+    read = results.read_run(tmp_path)
+    assert run.items() <= read.items()
+    assert {name for name in read if read[name] is not None} <= run.keys()
+    assert read["width"] is None  # every field is there
     assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
 
 
@@ -253,7 +256,7 @@ def test_a_run_that_cannot_be_written_leaves_the_former_one(tmp_path):
         results.write_run(tmp_path, {"seconds": math.nan})
     with pytest.raises(TypeError):
         results.write_run(tmp_path, {"path": tmp_path})
-    assert results.read_run(tmp_path) == {"frames": 3}
+    assert results.read_run(tmp_path)["frames"] == 3
     assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
 
 

@@ -10,6 +10,7 @@ standard error.  ``--debug`` shows the tracebacks that are kept from users.
 from __future__ import annotations
 
 import importlib
+import io
 import keyword
 import sys
 from typing import Any
@@ -109,3 +110,6 @@ class _Commands(click.Group):
 )
 def main(debug: bool) -> None:
     """Find satellites and debris in recordings of a telescope camera."""
+    # A file's name need not be Unicode.
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="surrogateescape")

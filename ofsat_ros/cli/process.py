@@ -19,8 +19,10 @@ from ofsat_ros.cli.terminal import (
     claim,
     fail,
     help_all,
+    in_words,
     of_table,
     parameter_options,
+    recording_argument,
     recording_options,
     say,
 )
@@ -34,7 +36,7 @@ from ofsat_ros.parameters import (
     preset_names,
 )
 from ofsat_ros.pipeline import Pipeline
-from ofsat_ros.processing import Processing
+from ofsat_ros.processing import Processing, Totals
 from ofsat_ros.recordings import Recording, RecordingError, open_recording
 from ofsat_ros.report import REPORT, write_report, write_video
 from ofsat_ros.results import (
@@ -50,14 +52,14 @@ from ofsat_ros.results.bag import BAG, ResultBag
 from ofsat_ros.tracking_data import TRACKING_DATA, TrackArcs
 
 # Options with which the same frames are opened again.
-_SOURCE = ("topic", "camera_info_topic", "attitude_topic", "fps", "exposure_s")
+_SOURCE = ("topic", "camera_info_topic", "attitude_topic", "fps", "exposure_s", "start_ns")
 
 
 @click.command(
     "process",
     epilog="Example: ofsat process night1 -o night1_found --bag --tdm kvn",
 )
-@click.argument("recording", type=click.Path(path_type=Path))
+@recording_argument
 @click.option(
     "-o",
     "--output",
@@ -102,7 +104,7 @@ _SOURCE = ("topic", "camera_info_topic", "attitude_topic", "fps", "exposure_s")
 @parameter_options(Parameters, CameraParameters, TrackingDataParameters)
 @help_all
 def command(
-    recording: Path,
+    paths: tuple[Path, ...],
     output: Path,
     report: bool | None,
     video: Path | None,
@@ -115,7 +117,7 @@ def command(
     as_json: bool,
     **options: Any,
 ) -> None:
-    """Detect RSOs in RECORDING: a bag, FITS, SER, a video, or images; a file or a folder."""
+    """Detect RSOs in RECORDING: a bag, FITS, SER, video, images; a file, a folder, or several."""
     given = {name: value for name, value in options.items() if value is not None}
     if video is not None and video.suffix.lower() not in (".mp4", ".gif"):
         raise click.BadParameter(f"{video} ends neither in .mp4 nor in .gif", param_hint="--video")
@@ -137,7 +139,7 @@ def command(
     try:
         with ExitStack() as stack:
             source = {name: options[name] for name in _SOURCE}
-            frames = stack.enter_context(open_recording(recording, **source))
+            frames = stack.enter_context(open_recording(paths, **source))
             _claim(output, bag, video, force)
             writer = stack.enter_context(ResultWriter(output))
             scale = DetectorParameters().marker_scale
@@ -148,7 +150,7 @@ def command(
             finally:
                 # Also when stopped: whole, with what was done.
                 made += _write_arcs(arcs, output, formats, processing.note)
-                run |= source | _origin(frames) | processing.totals.as_dict()
+                run |= source | _origin(paths, frames) | processing.totals.as_dict()
                 run["seconds"] = time.monotonic() - start_s
                 write_run(output, run)
         if processing.totals.frames:
@@ -157,11 +159,10 @@ def command(
     except (RecordingError, OSError) as error:
         fail(error)
     except KeyboardInterrupt:
-        page = f"; `ofsat report {output}` makes a page of it" * bool(processing.totals.frames)
-        say(f"stopped; {processing.totals} so far, in {output}{page}")
+        say(_stopped(processing.totals, output, done=not run["stopped"]))
         sys.exit(130)
     if not processing.totals.frames:
-        fail(f"no frame of {recording} could be processed")
+        fail(f"no frame of {frames.path} could be processed")
     if as_json:
         click.echo(json.dumps(run, indent=2, ensure_ascii=False))
         return
@@ -183,11 +184,20 @@ def _claim(output: Path, bag: bool, video: Path | None, force: bool) -> None:
     claim(output, files, force)
 
 
-def _origin(frames: Recording) -> dict[str, Any]:
+def _stopped(totals: Totals, output: Path, done: bool) -> str:
+    """Say what is there after Ctrl-C, and what is still to be had of it."""
+    if not totals.frames:
+        return "stopped; no frame was processed"
+    far = "" if done else " so far"
+    return f"stopped; {totals}{far}, in {output}; `ofsat report {output}` makes a page of it"
+
+
+def _origin(paths: tuple[Path, ...], frames: Recording) -> dict[str, Any]:
     """Return what was opened; None where there is none."""
     topics = (frames.topic, frames.camera_info_topic, frames.attitude_topic)
     names = dict(zip(_SOURCE, (topic or None for topic in topics), strict=False))
-    return {"recording": f"{frames.path.resolve()}", **names}
+    where = [f"{path.resolve()}" for path in paths]
+    return {"recording": where if len(where) > 1 else where[0], **names}
 
 
 def _write_report(output: Path, report: bool | None, video: Path | None) -> list[str]:
@@ -195,14 +205,17 @@ def _write_report(output: Path, report: bool | None, video: Path | None) -> list
     made = []
     try:
         if report is not False:
-            made.append(write_report(output).name)
+            made.append(write_report(output, say=say).name)
+    except (ModuleNotFoundError, ResultError, OSError) as error:
+        # A report that nobody has asked for is written where it can be.
+        if report:
+            fail(error)
+        say(f"note: no report is written: {in_words(error)}")
+    try:
         if video is not None:
             made.append(f"{write_video(output, video)}")
     except (ModuleNotFoundError, ResultError, RecordingError, OSError) as error:
-        # A report that nobody has asked for is written where it can be.
-        if report or video:
-            fail(error)
-        say(f"note: no report is written: {error}")
+        fail(error)
     return made
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import click
 
-from ofsat_ros.cli.terminal import fail
+from ofsat_ros.cli.terminal import fail, say
 from ofsat_ros.recordings import RecordingError
-from ofsat_ros.report import REPORT, write_report, write_video
+from ofsat_ros.report import write_report, write_video
 from ofsat_ros.results import ResultError
 
 
@@ -36,13 +36,19 @@ def command(results: Path, recording: Path | None, video: Path | None, force: bo
         fail(f"there is nothing at {recording}")
     if video is not None and video.exists() and not force:
         fail(f"{video} exists: choose another name, or --force to replace it")
-    made = [results / REPORT]
+    made: list[Path] = []
     try:
-        write_report(results, recording)
+        made.append(write_report(results, recording, say))
         if video is not None:
             made.append(write_video(results, video, recording))
     except (ImportError, RecordingError, ResultError, OSError) as error:
         fail(error)
     except KeyboardInterrupt:
+        say(f"stopped; {_written(made)}")
         sys.exit(130)
-    click.echo(f"{' and '.join(map(str, made))} {'is' if len(made) == 1 else 'are'} written")
+    click.echo(_written(made))
+
+
+def _written(made: list[Path]) -> str:
+    names = " and ".join(map(str, made)) or "nothing"
+    return f"{names} {'are' if len(made) > 1 else 'is'} written"

@@ -12,14 +12,21 @@ from typing import Any
 
 import click
 
-from ofsat_ros.cli.terminal import fail, help_all, recording_options, say
+from ofsat_ros.cli.terminal import (
+    fail,
+    help_all,
+    process_words,
+    recording_argument,
+    recording_options,
+    say,
+)
 from ofsat_ros.pipeline import ImageError
 from ofsat_ros.recordings import RecordingError, open_recording
 from ofsat_ros.suggestion import Measurement, Suggestion, measure, suggest
 
 
 @click.command("suggest", epilog="Example: ofsat suggest night1 --pixel-scale 5")
-@click.argument("path", metavar="RECORDING", type=click.Path(path_type=Path))
+@recording_argument
 @recording_options
 @click.option(
     "--pixel-scale",
@@ -45,7 +52,7 @@ from ofsat_ros.suggestion import Measurement, Suggestion, measure, suggest
 @click.option("--json", "as_json", is_flag=True, help="print JSON instead of words")
 @help_all
 def command(
-    path: Path,
+    paths: tuple[Path, ...],
     pixel_scale: float | None,
     count: int,
     file: Path | None,
@@ -57,7 +64,7 @@ def command(
     try:
         if file is not None and file.exists() and not force:
             raise RecordingError(f"{file} exists: choose another name, or --force to replace it")
-        with open_recording(path, **options) as recording:
+        with open_recording(paths, **options) as recording:
             measured = measure(islice(recording, count))
             for problem in recording.problems:
                 say(f"note: {problem}")
@@ -67,14 +74,15 @@ def command(
         if file is not None:
             file.write_text(_yaml(suggestion), encoding="utf-8")
     except ImageError as error:
-        fail(f"no frame of {path} could be processed: {error}")
+        fail(f"no frame of {paths[0]} could be processed: {error}")
     except (RecordingError, OSError) as error:
         fail(error)
     if as_json:
         click.echo(json.dumps(suggestion.as_dict(), indent=2))
         return
     click.echo("\n".join(_words(suggestion)))
-    click.echo(f"\n{_process(path, options, suggestion)}")
+    words = process_words(paths, options | suggestion.changes)
+    click.echo(f"\n{shlex.join(words)}")
 
 
 def _words(suggestion: Suggestion) -> list[str]:
@@ -109,16 +117,6 @@ def _facts(m: Measurement) -> dict[str, str]:
 
 def _if_known(value: float, words: str) -> str:
     return words if math.isfinite(value) else ""
-
-
-def _process(path: Path, options: dict[str, Any], suggestion: Suggestion) -> str:
-    """Return the command that uses the suggestion."""
-    words = ["ofsat", "process", f"{path}", "-o", "results"]
-    for name, value in (options | suggestion.changes).items():
-        if value is not None:
-            option = name.replace("_", "-") if name != "exposure_s" else "exposure"
-            words += [f"--{option}", f"{value}"]
-    return shlex.join(words)
 
 
 def _yaml(suggestion: Suggestion) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import sys
 
 import click
@@ -21,6 +22,11 @@ def command(namespace: str) -> None:
     A table that refreshes, for a terminal of 80 columns; a wider one shows more of each track.
     The same as `ros2 run ofsat_ros watch`.
     """
+    if not re.fullmatch(r"/?([A-Za-z_]\w*(/[A-Za-z_]\w*)*)?/?", namespace, re.ASCII):
+        raise click.BadParameter(
+            f"{namespace!r} is no namespace: names of letters, digits and _, between slashes",
+            param_hint="--namespace",
+        )
     if importlib.util.find_spec("rclpy") is None:
         fail(
             "watch listens to ROS 2, which is not here: `source /opt/ros/jazzy/setup.bash`, or"

@@ -7,7 +7,6 @@ The first step of a report: everything after it, pictures, charts and words, sta
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -90,6 +89,11 @@ class Track:
         return float(np.median(self.rows["snr"]))
 
     @property
+    def flux(self) -> float:
+        """Median flux, DN."""
+        return float(np.median(self.rows["flux"]))
+
+    @property
     def speed(self) -> float:
         """Median speed against the stars, px/s."""
         return float(np.median(np.hypot(self.rows["rel_vx_px_s"], self.rows["rel_vy_px_s"])))
@@ -159,12 +163,17 @@ class Findings:
         """The row in `frames` of each frame's number."""
         return {int(number): row for row, number in enumerate(self.frames["frame"])}
 
-    @property
+    @cached_property
     def main_stretch(self) -> NDArray[np.intp]:
         """Rows of the longest stretch of frames; empty without frames."""
         if not len(self.frames):
             return np.zeros(0, np.intp)
         return np.flatnonzero(self.stretch == np.bincount(self.stretch).argmax())
+
+    def is_in_main_stretch(self, track: Track) -> bool:
+        """Whether a track, which no break outlives, lies on the same sky as `main_stretch`."""
+        last = self.row_of[int(track.rows["frame"][-1])]
+        return bool(self.stretch[last] == self.stretch[self.main_stretch[0]])
 
     @cached_property
     def step_s(self) -> float:
@@ -190,8 +199,8 @@ def read_findings(folder: Path) -> Findings:
         If a file cannot be read.
     """
     run = read_run(folder)
-    run["frames"] = run.get("frames") or 0
-    run["width"], run["height"] = run.get("width") or 0, run.get("height") or 0
+    for count in ("frames", "width", "height"):
+        run[count] = max(run[count] or 0, 0)
     detections = _read(folder / DETECTIONS, DETECTION_COLUMNS)
     frames = _read(folder / STAR_FIELD, STAR_FIELD_COLUMNS)
     centre = (run["width"] - 1) / 2, (run["height"] - 1) / 2
@@ -219,29 +228,27 @@ def _read(path: Path, columns: tuple[str, ...]) -> NDArray[np.void]:
     dtype = np.dtype([(name, _kind(name)) for name in columns])
     if not path.is_file():
         raise ResultError(f"{path.parent} holds no {path.name}: run ofsat process again")
-    with path.open(encoding="utf-8", newline="") as file:
+    # What a crash has left at the end may be anything.
+    with path.open(encoding="utf-8", errors="replace", newline="") as file:
         lines = list(csv.reader(file))
     if not lines or tuple(lines[0]) != columns:
         raise ResultError(f"{path} has other columns than this version writes: process again")
     if len(lines) > 1 and len(lines[-1]) != len(columns):
         lines.pop()
+    for number, line in enumerate(lines[1:], 2):
+        if len(line) != len(columns):
+            raise ResultError(f"{path} is damaged in line {number}; run ofsat process again")
+    table = np.zeros(len(lines) - 1, dtype)
     try:
-        rows = [tuple(_values(line, columns)) for line in lines[1:]]
+        for name, cells in zip(columns, zip(*lines[1:], strict=True), strict=False):
+            table[name] = cells if name == "note" else np.array(cells).astype(dtype[name])
     except ValueError as error:
         raise ResultError(f"{path} is damaged: {error}; run ofsat process again") from error
-    return np.array(rows, dtype)
+    return table
 
 
 def _kind(name: str) -> str:
     return "O" if name == "note" else "i8" if name in _WHOLE else "f8"
-
-
-def _values(line: list[str], columns: tuple[str, ...]) -> Iterable[Any]:
-    for name, cell in zip(columns, line, strict=True):
-        if name == "note":
-            yield cell
-        else:
-            yield int(cell) if name in _WHOLE else float(cell)
 
 
 def _follow_stars(

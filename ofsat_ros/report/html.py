@@ -9,23 +9,21 @@ from __future__ import annotations
 
 import base64
 import os
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
+from ofsat_ros.recordings import RecordingError
 from ofsat_ros.report import words
+from ofsat_ros.report.again import open_again, processed
 from ofsat_ros.report.charts import Series, chart, sparkline
 from ofsat_ros.report.findings import Findings, Track, read_findings
 from ofsat_ros.report.looks import CutOuts, Gallery, Sky, View
 from ofsat_ros.results import ResultError
-
-if TYPE_CHECKING:
-    from ofsat_ros.recordings import Recording
 
 REPORT = "report.html"
 _TEMPLATES = Path(__file__).with_name("page")
@@ -35,11 +33,17 @@ _COLOURS = 8
 _QUALITY = 82
 # Points that a drawn path has at most.
 _PATH_POINTS = 240
+# Of more recordings than these, the first and the last are named.
+_PATHS = 3
 # Streaks shorter than this, px, say nothing.
 _LEAST_STREAK_PX = 5.0
 
 
-def write_report(folder: str | Path, recording: str | Path | None = None) -> Path:
+def write_report(
+    folder: str | Path,
+    recording: str | Path | None = None,
+    say: Callable[[str], None] = lambda line: None,
+) -> Path:
     """Write ``report.html`` into a folder of results; an older one is replaced.
 
     Parameters
@@ -48,14 +52,19 @@ def write_report(folder: str | Path, recording: str | Path | None = None) -> Pat
         What ``ofsat process`` has made.
     recording : str or Path, optional
         Where the recording is now, if not where it was.
+    say : callable, optional
+        Takes a line for the user.
 
     Returns
     -------
     Path
-        The file.  Where the recording cannot be read it has no pictures, and says why.
+        The file.  Where the recording cannot be read, and none was given, it has no pictures, and
+        says why.
 
     Raises
     ------
+    RecordingError
+        If the recording that was given cannot be read, or is another one.
     ModuleNotFoundError
         If jinja2 is missing; the message names the extra that brings it.
     ResultError
@@ -69,21 +78,18 @@ def write_report(folder: str | Path, recording: str | Path | None = None) -> Pat
         raise ModuleNotFoundError(
             "the report needs jinja2: pip install 'ofsat_ros[report]'", name=error.name
         ) from error
-    # Imported where it is needed: live, only pictures of frames are, and a node starts sooner.
-    from ofsat_ros.recordings import RecordingError
-
     folder = Path(folder)
     findings = read_findings(folder)
-    tracks = findings.tracks[:_GALLERIES]
-    sky, cut_outs = Sky(findings), CutOuts(tracks)
+    views: list[View] = []
+    galleries: dict[int, Gallery] = {}
     no_pictures = ""
     try:
-        with open_again(findings, recording) as frames:
-            for number, image in fitting(frames, findings, "pictures"):
-                sky.add(findings.row_of[number], image)
-                cut_outs.add(number, image)
+        views, galleries = _pictures(findings, recording)
     except (RecordingError, OSError) as error:
-        no_pictures = f"{error}"
+        if recording:
+            raise
+        no_pictures = f"no pictures: {error}"
+        say(f"note: {REPORT} has {no_pictures}")
     environment = Environment(
         loader=FileSystemLoader(_TEMPLATES),
         autoescape=True,
@@ -98,78 +104,49 @@ def write_report(folder: str | Path, recording: str | Path | None = None) -> Pat
     page = environment.get_template("page.html").render(
         **_about(findings),
         no_pictures=no_pictures,
-        views=[_view(view, findings.tracks) for view in sky.views()],
-        tracks=_tracks(findings, cut_outs.galleries()),
+        views=[_view(view, findings) for view in views],
+        tracks=_tracks(findings, galleries),
         unlisted=max(len(findings.tracks) - _ROWS, 0),
         **_charts(findings),
     )
     path, unfinished = folder / REPORT, folder / f".{REPORT}.part"
     try:
-        unfinished.write_text(page, encoding="utf-8")
+        # A file's name need not be Unicode.
+        unfinished.write_text(page, encoding="utf-8", errors="replace")
         os.replace(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)
     return path
 
 
-def open_again(findings: Findings, recording: str | Path | None) -> Recording:
-    """Open the recording that the findings are of.
-
-    Raises
-    ------
-    RecordingError
-        If it is not there, or not readable.
-    """
-    from ofsat_ros.recordings import RecordingError, open_recording
-
-    run = findings.run
-    path = Path(recording or run.get("recording") or "")
-    if not path.name or not path.exists():
-        raise RecordingError(
-            f"the recording is not at {path}: say where it is with --recording PATH"
-        )
-    given = {name: run[name] for name in ("topic", "fps", "exposure_s") if run.get(name)}
-    return open_recording(path, **given)
-
-
-def fitting(
-    frames: Recording, findings: Findings, doing: str
-) -> Iterator[tuple[int, NDArray[np.generic]]]:
-    """Yield number and image of each frame that was processed.
-
-    Raises
-    ------
-    RecordingError
-        If a frame is of another size than those that were processed.
-    """
-    from ofsat_ros.recordings import RecordingError
-
-    size = findings.run["height"], findings.run["width"]
-    bar = tqdm(frames, doing, unit=" frames", dynamic_ncols=True, disable=None, leave=False)
-    for frame in bar:
-        if frame.number not in findings.row_of:
-            continue
-        if frame.image.shape != size:
-            height, width = frame.image.shape
-            raise RecordingError(
-                f"{frames.path} is another recording: its images are {width}x{height}, those of"
-                f" {findings.folder} were {size[1]}x{size[0]}"
-            )
-        yield frame.number, frame.image
+def _pictures(
+    findings: Findings, recording: str | Path | None
+) -> tuple[list[View], dict[int, Gallery]]:
+    """Look at the recording again."""
+    sky, cut_outs = Sky(findings), CutOuts(findings.tracks[:_GALLERIES])
+    with open_again(findings, recording) as frames:
+        for number, image in processed(frames, findings, "pictures"):
+            sky.add(findings.row_of[number], image)
+            cut_outs.add(number, image)
+    return sky.views(), cut_outs.galleries()
 
 
 def _about(findings: Findings) -> dict[str, Any]:
     run, frames = findings.run, findings.frames
+    named = words.recordings(run) or ["?"]
     used = words.parameters_used(run)
     profile = sorted((run.get("profile") or {}).items(), key=lambda row: -row[1])
     return {
         "headline": words.headline(findings),
         "lead": words.lead(findings),
         "run": run,
-        "recording": Path(run.get("recording") or "?").name,
+        "recording": ", ".join(Path(path).name for path in named)
+        if len(named) <= _PATHS
+        else f"{len(named)} files, from {Path(named[0]).name} to {Path(named[-1]).name}",
+        "paths": named if len(named) <= _PATHS else [named[0], "…", named[-1]],
         "first_ns": int(frames["stamp_ns"][0]) if len(frames) else None,
         "span_s": float(findings.seconds[-1]) if len(frames) else 0.0,
-        "step_s": findings.step_s if len(frames) > 1 else float("nan"),
+        "step_s": findings.step_s if (frames["dt_s"] > 0).any() else float("nan"),
         "stars": float(np.median(frames["stars"][1:])) if len(frames) > 1 else float("nan"),
         "candidates": int((findings.detections["track_id"] == 0).sum()),
         "changed": [row for row in used if row[2]],
@@ -180,10 +157,13 @@ def _about(findings: Findings) -> dict[str, Any]:
     }
 
 
-def _view(view: View, tracks: list[Track]) -> dict[str, Any]:
+def _view(view: View, findings: Findings) -> dict[str, Any]:
     height, width = view.picture.shape
-    drawn = []
-    for i, track in enumerate(tracks[:_ROWS]):
+    drawn, elsewhere = [], 0
+    for i, track in enumerate(findings.tracks[:_ROWS]):
+        if not findings.is_in_main_stretch(track):
+            elsewhere += 1
+            continue
         path = view.paths(track)
         points = path[np.unique(np.linspace(0, len(path) - 1, _PATH_POINTS).round().astype(int))]
         x, y = path[-1]
@@ -204,6 +184,7 @@ def _view(view: View, tracks: list[Track]) -> dict[str, Any]:
         "width": width,
         "height": height,
         "tracks": drawn,
+        "elsewhere": elsewhere,
     }
 
 
@@ -228,7 +209,7 @@ def _tracks(findings: Findings, galleries: dict[int, Gallery]) -> list[dict[str,
                 "snr": track.snr,
                 "snr_low": float(rows["snr"].min()),
                 "snr_high": float(rows["snr"].max()),
-                "flux": float(np.median(rows["flux"])),
+                "flux": track.flux,
                 "speed": track.speed,
                 "heading_deg": float(np.degrees(np.arctan2(rel_vy, rel_vx))),
                 "sensor_speed": float(np.median(own)),
@@ -359,6 +340,7 @@ def _charts(findings: Findings) -> dict[str, Any]:
     if np.nanmax(np.abs(frames["rotation_deg"]), initial=0) > 0:
         rotation = Series("", frames["rotation_deg"])
         stars.append(one("Rotation", "degrees a frame, from x to y", rotation, from_zero=False))
+    about = "of RSOs" + " and candidates" * bool(findings.run["live"])
     images = [
         one("Background", "DN", Series("", frames["background"]), from_zero=False),
         one(
@@ -368,7 +350,7 @@ def _charts(findings: Findings) -> dict[str, Any]:
             Series("", frames["threshold"], "s1"),
         ),
         one("Objects", "over the threshold", Series("", frames["objects"])),
-        one("Detections", "RSOs, in the last word on each frame", Series("", found)),
+        one("Detections", about, Series("", found)),
     ]
     return {
         "star_charts": [row for row in stars if row[2]],

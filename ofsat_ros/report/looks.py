@@ -38,6 +38,8 @@ _SHOWN, _LEAST_HALF, _LARGEST_HALF = 16, 16, 48
 _DARKEST, _BRIGHTEST = -1.5, 12.0
 # Sigmas up to which a picture is linear.
 _KNEE = 4.0
+# Sigmas; darker than anything is.
+_DARK = -1e30
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,8 @@ class Sky:
         run, rows = findings.run, findings.main_stretch
         self._size = run["width"], run["height"]
         self._scale = _scale(*self._size)
+        # Large frames are made small at once: all that is kept of them, memory has to hold.
+        self._reduced, self._enlarged = min(self._scale, 1.0), max(self._scale, 1.0)
         moved = findings.to_sky[rows][:, :2] @ np.array(
             [(self._size[0] - 1) / 2, (self._size[1] - 1) / 2, 1.0]
         )
@@ -94,9 +98,9 @@ class Sky:
     def add(self, row: int, image: NDArray[np.generic]) -> None:
         """Take one frame, that of a row of the findings' frames."""
         if row in self._sensor_rows or row in self._rows or row in self._first_rows:
-            values = self._in_sigmas(row, image)
+            values = _scaled(self._in_sigmas(row, image), self._reduced)
             if row in self._sensor_rows:
-                self._sensor.append(_scaled(values, self._scale))
+                self._sensor.append(_scaled(values, self._enlarged))
             if row in self._first_rows:
                 self._first.append((row, values))
             elif row in self._rows:
@@ -105,12 +109,14 @@ class Sky:
     def views(self) -> list[View]:
         """Return the pictures; those that say most first."""
         self._lay_first()
-        views = []
-        if self._canvas.is_laid:
+        views, frames, place = [], self._canvas.frames, self._canvas.from_sky
+        if frames == 1:
+            single, _ = self._canvas.mean_and_maximum()
+            about = "a single frame: there is no other to lay on it"
+            views.append(View("Frame", about, _stretched(_flat(single)), True, place))
+        elif frames:
             # The mean is deep, the maximum shows what was in a place in one frame only.
             mean, brightest = self._canvas.mean_and_maximum()
-            frames = len(self._rows)
-            place = self._canvas.from_sky
             about = f"the mean of {frames} frames, laid on the stars: what is fixed on the sky"
             views.append(View("Deep sky", about, _stretched(_flat(mean)), True, place))
             about = (
@@ -119,9 +125,10 @@ class Sky:
             )
             views.append(View("Movers", about, _stretched(_flat(brightest)), True, place))
         if self._sensor:
-            median = _flat(np.median(np.stack(self._sensor), axis=0).astype(np.float32))
+            stack = np.stack(self._sensor)
+            median = _flat(np.median(stack, axis=0, overwrite_input=True).astype(np.float32))
             about = (
-                f"the median of {len(self._sensor)} frames as the sensor sees them: what the mount"
+                f"the median of {len(stack)} frames as the sensor sees them: what the mount"
                 " follows stands still, stars that move fade"
             )
             place = np.hstack([np.eye(2) * self._scale, np.full((2, 1), (self._scale - 1) / 2)])
@@ -137,34 +144,38 @@ class Sky:
 
     def _in_sigmas(self, row: int, image: NDArray[np.generic]) -> _Image:
         frame = self._findings.frames[row]
-        values = image.astype(np.float32)
         level, noise = frame["background"], frame["noise"]
-        level = level if np.isfinite(level) else np.median(values)
-        values -= np.float32(level)
-        return values / np.float32(noise if np.isfinite(noise) and noise > 0 else 1)
+        level = level if np.isfinite(level) else np.median(image.astype(np.float32))
+        per_dn = 1 / noise if np.isfinite(noise) and noise > 0 else 1.0
+        values = cv2.addWeighted(image, per_dn, image, 0, -level * per_dn, dtype=cv2.CV_32F)
+        if image.dtype.kind == "f":  # what is missing is as dark as the sky
+            np.nan_to_num(values, copy=False, nan=0, posinf=0, neginf=0)
+        return np.asarray(values)
 
     def _lay(self, row: int, values: _Image) -> None:
         self._lay_first()
         if self._pattern is not None:
             values = values - self._pattern
-        self._canvas.lay(_scaled(values, self._scale), self._findings.to_sky[row])
+        self._canvas.lay(_scaled(values, self._enlarged), self._findings.to_sky[row])
 
     def _lay_first(self) -> None:
         """Learn the sensor's pattern from the first frames, and lay them, too."""
         first, self._first = self._first, []
         if not first:
             return
-        stack = np.sort(np.stack([values for _, values in first]), axis=0)
-        even = _even(stack[len(stack) // 2])
+        stack = np.stack([values for _, values in first])
+        middle, darker = len(stack) // 2, int(_PATTERN_SHARE * len(stack))
+        stack.partition([darker, middle], axis=0)
+        even = _even(stack[middle])
         if self._pattern_shows:
-            dark = stack[int(_PATTERN_SHARE * len(stack))]
+            dark = stack[darker]
             # What the mount follows stands still, too, and is no pattern.
             shown = np.isin(self._findings.detections["frame"], self._numbers(first))
             followed = np.zeros(dark.shape, np.uint8)
             for found in self._findings.detections[shown]:
-                at = (round(found["x_px"]), round(found["y_px"]))
-                half = round(6 + np.nan_to_num(found["length_px"]) / 2)
-                cv2.circle(followed, at, half, 1, -1)
+                at = [round(found[name] * self._reduced) for name in ("x_px", "y_px")]
+                half = (6 + np.nan_to_num(found["length_px"]) / 2) * self._reduced
+                cv2.circle(followed, at, round(half), 1, -1)
             dark = np.where(followed, _even(dark), dark)
             self._pattern = dark
         else:
@@ -196,7 +207,8 @@ class _Canvas:
         self._shape = max(round(tall * less), 1), max(round(wide * less), 1)
         self._sum = np.zeros(self._shape, np.float32)
         self._count = np.zeros(self._shape, np.float32)
-        self._maximum = np.full(self._shape, -np.inf, np.float32)
+        self._maximum = np.full(self._shape, _DARK, np.float32)
+        self.frames = 0
 
     def lay(self, image: _Image, to_sky: Array) -> None:
         scale = self._scale
@@ -216,14 +228,13 @@ class _Canvas:
             image, matrix[:2], tuple((high - low).tolist()), borderValue=float("nan")
         )
         part = np.s_[low[1] : high[1], low[0] : high[0]]
-        self._count[part] += np.isfinite(laid)
-        np.fmax(self._maximum[part], laid, out=self._maximum[part])
-        cv2.patchNaNs(laid, 0)
+        known = (laid == laid).view(np.uint8)
+        self._count[part] += known
+        cv2.patchNaNs(laid, _DARK)
+        np.maximum(self._maximum[part], laid, out=self._maximum[part])
+        laid *= known
         self._sum[part] += laid
-
-    @property
-    def is_laid(self) -> bool:
-        return bool(self._count.any())
+        self.frames += 1
 
     def mean_and_maximum(self) -> tuple[_Image, _Image]:
         unknown = self._count == 0
@@ -284,9 +295,9 @@ class CutOuts:
         """Take the frame of a number."""
         for of, x, y in self._in_frame.get(number, ()):
             cut = _cut(image, x, y, of.half)
-            if cut is None:
-                continue
             known = np.isfinite(cut)
+            if not known.any():
+                continue
             of.sum += np.where(known, cut, 0)
             of.known += known
             of.count += 1
@@ -298,15 +309,15 @@ class CutOuts:
         return {number: _gallery(cuts) for number, cuts in self._tracks.items() if cuts.count}
 
 
-def _cut(image: NDArray[np.generic], x: float, y: float, half: int) -> _Image | None:
-    """What lies around a place, to a part of a pixel; NaN outside the image, None if all is."""
+def _cut(image: NDArray[np.generic], x: float, y: float, half: int) -> _Image:
+    """What lies around a place, to a part of a pixel; NaN outside the image."""
     side = 2 * half + 1
     # Only as much as is cut, since a whole image costs time to convert.
     left, top = int(x) - half - 2, int(y) - half - 2
     begin = max(left, 0), max(top, 0)
     near = image[begin[1] : top + side + 4, begin[0] : left + side + 4].astype(np.float32)
     if not near.size:
-        return None
+        return np.full((side, side), np.nan, np.float32)
     x, y = x - begin[0], y - begin[1]
     if near.shape == (side + 4, side + 4):  # quicker, but repeats the image's edge
         return np.asarray(cv2.getRectSubPix(near, (side, side), (x, y)))
@@ -321,7 +332,7 @@ def _gallery(of: _Cuts) -> Gallery:
     values = np.concatenate([cut.ravel() for _, cut in cuts])
     noise = _sigma(values[np.isfinite(values)])
     middle = np.s_[of.half - 2 : of.half + 3, of.half - 2 : of.half + 3]
-    bright = float(np.median([np.nanmax(cut[middle]) for _, cut in cuts]))
+    bright = float(np.median([np.nan_to_num(cut[middle]).max() for _, cut in cuts]))
     limits = _DARKEST * noise, max(bright, 6 * noise), _KNEE * noise
     return Gallery(
         [(number, _asinh(cut, *limits)) for number, cut in cuts], _stretched(mean), of.count

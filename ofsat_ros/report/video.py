@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from ofsat_ros.detection import CANDIDATE, CONFIRMED, DETECTION_DTYPE
 from ofsat_ros.pipeline import FrameResult
+from ofsat_ros.report.again import open_again, processed
 from ofsat_ros.report.findings import Findings, read_findings
-from ofsat_ros.report.html import fitting, open_again
 from ofsat_ros.report.picture import annotate
 from ofsat_ros.report.words import instant
 from ofsat_ros.results import ResultError
@@ -59,7 +59,7 @@ def write_video(folder: str | Path, path: str | Path, recording: str | Path | No
     ResultError
         If the folder holds no results, or the name ends otherwise.
     RecordingError
-        If the recording cannot be read.
+        If the recording cannot be read, or is another one.
     OSError
         If a file cannot be read, or written.
     """
@@ -77,7 +77,7 @@ def write_video(folder: str | Path, path: str | Path, recording: str | Path | No
     unfinished = path.with_name(f".{path.name}.part")
     try:
         with film(unfinished, rate) as show, open_again(findings, recording) as frames:
-            for number, image in fitting(frames, findings, "video"):
+            for number, image in processed(frames, findings, "video"):
                 row = findings.row_of[number]
                 if row % every == 0:
                     result, footer = _result(findings, row)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ofsat_ros.parameters import TABLES, Description, ParameterError, Parameters
+from ofsat_ros.recordings import utc_text
 from ofsat_ros.report.findings import Findings
 
 # Slower than this, px per frame, stars are said to stand still.
@@ -69,12 +70,12 @@ def lead(findings: Findings) -> str:
 
 
 def _brightest(findings: Findings) -> str:
-    track = max(findings.tracks, key=lambda one: one.snr)
+    track = max(findings.tracks, key=lambda one: np.nan_to_num(one.flux))
     frames = len(findings.frames)
     seen = len(np.unique(track.rows["frame"]))
-    often = "every frame" if seen == frames else f"{seen} of them"
-    if seen >= frames - 1 and seen < frames:
-        often = "all but one of them"
+    often = "every frame" if seen == frames else count(seen, "frame")
+    if seen == frames - 1:
+        often = "all frames but one"
     name = f"The brightest, #{track.number}," if len(findings.tracks) > 1 else f"#{track.number}"
     speed = f"{number(track.speed * findings.step_s, 2)} px a frame"
     if math.isfinite(track.arcsec_per_s):
@@ -90,11 +91,12 @@ def _why_none(findings: Findings) -> str:
     blind = int(np.isnan(frames["dx_px"][1:]).sum())
     words = []
     if len(frames) == 1:
-        return "A single frame shows no motion: two at least are needed, several are better."
+        return "A single frame shows no motion: three at least are needed, ten are good."
+    if len(frames) == 2:
+        words.append("An RSO is known as such in its third frame at the earliest: there are two.")
     if blind:
         words.append(
-            f"The star field's motion was not found in {blind} of {count(len(frames), 'frame')}"
-            " (see the stars below)."
+            f"The star field's motion was not found in {blind} of {count(len(frames), 'frame')}."
         )
     notes = Counter(note for note in frames["note"][1:] if note)
     last = frames["note"][-1] or (notes.most_common(1)[0][0] if notes else "")
@@ -148,12 +150,19 @@ def parameters_used(run: dict[str, Any]) -> list[tuple[Description, Any, bool]]:
     ]
 
 
+def recordings(run: dict[str, Any]) -> list[str]:
+    """Return the paths of what was processed; empty if that is not told."""
+    told = run.get("recording") or []
+    return [told] if isinstance(told, str) else list(told)
+
+
 def command_line(run: dict[str, Any]) -> str:
     """Return the command that gives these results again, with this version's presets."""
-    words = ["ofsat", "process", run.get("recording") or "RECORDING", "-o", "results"]
-    for name in ("topic", "camera_info_topic", "attitude_topic", "fps", "exposure_s"):
+    words = ["ofsat", "process", *(recordings(run) or ["RECORDING"]), "-o", "results"]
+    for name in ("topic", "camera_info_topic", "attitude_topic", "fps", "exposure_s", "start_ns"):
         if run.get(name) not in (None, ""):
-            words += [_OPTIONS.get(name, _option(name)), f"{run[name]}"]
+            value = run[name] if name != "start_ns" else utc_text(run[name])
+            words += [_OPTIONS.get(name, _option(name)), f"{value}"]
     preset = run.get("preset") or ""
     try:
         of_preset = Parameters.preset(preset).as_dict()
@@ -172,7 +181,7 @@ def command_line(run: dict[str, Any]) -> str:
     return shlex.join(words)
 
 
-_OPTIONS = {"exposure_s": "--exposure"}
+_OPTIONS = {"exposure_s": "--exposure", "start_ns": "--start"}
 
 
 def _option(name: str) -> str:

@@ -13,6 +13,26 @@ from typing import Any
 
 RUN = "run.json"
 
+_COUNTS = ("frames", "left_out", "width", "height", "first_stamp_ns", "last_stamp_ns", "start_ns")
+_WORDS = ("version", "preset", "started_utc", "topic", "camera_info_topic", "attitude_topic")
+# What each field holds, if it is not null.
+_KINDS: dict[str, tuple[type, ...]] = {
+    **dict.fromkeys(_WORDS, (str,)),
+    **dict.fromkeys(_COUNTS, (int,)),
+    **dict.fromkeys(("fps", "exposure_s", "seconds"), (int, float)),
+    **dict.fromkeys(("parameters", "profile", "unlocated"), (dict,)),
+    **dict.fromkeys(("problems", "files"), (list,)),
+    **dict.fromkeys(("live", "stopped"), (bool,)),
+    "recording": (str, list),
+}
+# And what is in those that hold several.
+_PARTS: dict[str, tuple[type, ...]] = {
+    "recording": (str,),
+    "problems": (str,),
+    "profile": (int, float),
+    "unlocated": (int,),
+}
+
 
 class ResultError(ValueError):
     """A folder that holds no results; the message says what is missing."""
@@ -26,15 +46,15 @@ def write_run(folder: str | Path, run: Mapping[str, Any]) -> None:
     folder : str or Path
         Existing folder.
     run : mapping of str to what JSON holds
-        ``version`` of this package; ``recording`` (absolute path), ``topic``,
-        ``camera_info_topic``, ``attitude_topic``, ``fps`` and ``exposure_s``, with which
-        ``open_recording`` gives the same frames again; ``preset``, and ``parameters`` as used, by
-        their names; ``live``; counts ``frames`` and ``left_out``; ``first_stamp_ns`` and
-        ``last_stamp_ns`` as in the tables, ``width`` and ``height`` (px), all null without a
-        frame; ``started_utc`` (ISO 8601) and ``seconds`` it took; ``profile``, seconds by stage;
-        ``problems``, the notes that the user was given; ``unlocated``, counts of detections
-        without direction by the reason; ``files`` made; ``stopped``, whether the run ended before
-        the recording did.
+        ``version`` of this package; ``recording`` (absolute path, or a list of several),
+        ``topic``, ``camera_info_topic``, ``attitude_topic``, ``fps``, ``exposure_s`` and
+        ``start_ns``, with which ``open_recording`` gives the same frames again; ``preset``, and
+        ``parameters`` as used, by their names; ``live``; counts ``frames`` and ``left_out``;
+        ``first_stamp_ns`` and ``last_stamp_ns`` as in the tables, ``width`` and ``height`` (px),
+        all null without a frame; ``started_utc`` (ISO 8601) and ``seconds`` it took; ``profile``,
+        seconds by stage; ``problems``, the notes that the user was given; ``unlocated``, counts of
+        detections without direction by the reason; ``files`` made; ``stopped``, whether the run
+        ended before the recording did.
 
     Raises
     ------
@@ -45,14 +65,15 @@ def write_run(folder: str | Path, run: Mapping[str, Any]) -> None:
     unfinished = path.with_name(f".{RUN}.part")
     try:
         text = json.dumps(dict(run), indent=2, ensure_ascii=False, allow_nan=False)
-        unfinished.write_text(text + "\n", encoding="utf-8")
+        # Names that are no Unicode become JSON's own escapes.
+        unfinished.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
         os.replace(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)
 
 
 def read_run(folder: str | Path) -> dict[str, Any]:
-    """Return what `write_run` has written.
+    """Return what `write_run` has written; of its fields, those that are missing are None.
 
     Raises
     ------
@@ -70,4 +91,17 @@ def read_run(folder: str | Path) -> dict[str, Any]:
         raise ResultError(f"{path} is damaged: {error}; run ofsat process again") from error
     if not isinstance(run, dict):
         raise ResultError(f"{path} is damaged: it holds no object; run ofsat process again")
-    return run
+    for name, value in run.items():
+        if not _fits(name, value):
+            raise ResultError(f"{path} is damaged: {name} is {value!r}; run ofsat process again")
+    return dict.fromkeys(_KINDS) | run
+
+
+def _fits(name: str, value: Any) -> bool:
+    """Whether a field holds what it should."""
+    if value is None or name not in _KINDS:
+        return True
+    if not isinstance(value, _KINDS[name]):
+        return False
+    parts = value.values() if isinstance(value, dict) else value if type(value) is list else ()
+    return name not in _PARTS or all(isinstance(part, _PARTS[name]) for part in parts)

@@ -25,6 +25,8 @@ _FEW_OBJECTS, _LOWER_THRESHOLD = 20, 3.5
 _SLOW_ARCSEC_S, _FAST_ARCSEC_S = 15.0, 4000.0
 # An RSO that moves by so much over the history is found; more frames cost memory and time.
 _MOVED_PX, _MOST_FRAMES = 5.0, 30
+# A speed that is higher by less is hardly ever met.
+_WORTH_IT = 1.25
 # An RSO must be in the image three times.
 _SIGHTS = 3
 _WIDE_FWHM_PX, _BINNED_FWHM_PX = 6.0, 2.5
@@ -153,7 +155,8 @@ def _max_speed(m: Measurement, default: float) -> tuple[float, str]:
     seen = min(m.width, m.height) / _SIGHTS
     if step > seen:
         fast += f"; faster than {seen:.0f} px, it is in too few images"
-    return max(default, float(math.ceil(min(step, seen)))), fast
+    wanted = float(math.ceil(min(step, seen)))
+    return (wanted if wanted > _WORTH_IT * default else default), fast
 
 
 def _max_gap(m: Measurement, default: float) -> tuple[float, str]:
