@@ -311,6 +311,7 @@ class Pipeline:
                 result.shape,
                 parameters.star_field_model,
                 parameters.outlier_sigmas,
+                len(flow),
             )
         if motion is None or not motion.is_credible(expected):
             return

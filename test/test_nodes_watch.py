@@ -261,7 +261,8 @@ def watched() -> Iterator[tuple[Graph, Watch, Terminal]]:
 
 def test_over_dds_it_shows_what_the_detector_says(watched):
     graph, _, terminal = watched
-    graph.until(lambda: "nobody publishes /rso_tracks" in terminal.screen)
+    # A process that an earlier test has killed is remembered for 20 s, DDS's lease.
+    graph.until(lambda: "nobody publishes /rso_tracks" in terminal.screen, 2 * PATIENCE_S)
     graph.add(Detector(context=graph.context))
     camera = graph.publisher(Image, "image")
     graph.connect(camera)

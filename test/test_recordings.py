@@ -696,3 +696,19 @@ def test_useless_calibration_and_attitude_are_told_once_and_cost_no_frame(tmp_pa
     assert uncalibrated.startswith("/camera/camera_info: ")
     assert "not calibrated" in uncalibrated
     assert "a quaternion of length 2 is no rotation" in length
+
+
+def test_ctrl_c_in_the_midst_of_waiting_is_ctrl_c(tmp_path, monkeypatch):
+    def interrupted(_):
+        try:
+            raise KeyboardInterrupt
+        finally:
+            raise RuntimeError("cannot release un-acquired lock")  # as Condition does
+
+    simple_bag(tmp_path / "bag")
+    with open_recording(tmp_path / "bag") as recording:
+        monkeypatch.setattr("concurrent.futures.Future.result", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            next(iter(recording))
+        monkeypatch.undo()
+        assert len(list(recording)) == 3

@@ -139,3 +139,22 @@ def test_an_rso_is_seen_while_a_mount_follows_it(rate_deg_s):
     # the next, a velocity to 0.85 px/s; the field's adds to that.
     error = velocity[:, :2] - velocity[:, 2:]
     assert np.sqrt(np.mean(error**2)) < 1.5
+
+
+@pytest.mark.parametrize("seed", [3, 5])
+def test_a_cloud_over_all_invents_nothing(seed: int):
+    """Two frames without a star: the few vectors of the next that agree are no star field."""
+    random, covered = np.random.default_rng(seed), (11, 12)
+    pipeline, settled = Pipeline(), []
+    for number, shot in enumerate(scenario("survey", seed, width=480, height=360, frames=16)):
+        image = shot.image
+        if number in covered:
+            image = random.normal(3000, 300, image.shape).astype(image.dtype)
+        settled += pipeline.process(image, shot.stamp_ns).settled
+    settled += pipeline.finish()
+    found = [len(one.detections[one.detections["track_id"] > 0]) for one in settled]
+    assert all(count <= 8 for count in found), "there are eight RSOs"
+    # They are found again, by the same ids, as soon as the stars are.
+    ids = [set(one.detections["track_id"].tolist()) - {0} for one in settled]
+    assert len(ids[10] & ids[14]) >= 7
+    assert len(set.union(*ids)) == 8

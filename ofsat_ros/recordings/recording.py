@@ -218,7 +218,7 @@ class Recording:
         frames = self._read()
         coming = deque(self._thread.submit(self._next, frames) for _ in range(_AHEAD))
         self._coming = coming
-        while coming and (frame := coming.popleft().result()) is not None:
+        while coming and (frame := _result(coming.popleft())) is not None:
             coming.append(self._thread.submit(self._next, frames))
             yield frame
 
@@ -265,3 +265,13 @@ class Recording:
         self.skipped += 1
         if self.skipped <= _PROBLEMS_KEPT:
             self._said.append(f"{frame.name} skipped: {frame.reason}")
+
+
+def _result(coming: Future[Frame | None]) -> Frame | None:
+    try:
+        return coming.result()
+    except RuntimeError as error:
+        # Ctrl-C may hit the future's own lock, which then is not there to be released.
+        if isinstance(error.__context__, KeyboardInterrupt):
+            raise KeyboardInterrupt from None
+        raise
