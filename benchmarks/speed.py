@@ -235,7 +235,7 @@ def process_bag(folder: Path, sky: Sky) -> tuple[float, float, float]:
     with BagWriter(bag) as writer:
         for number in range(_FRAMES):
             writer.write_image("/image", load(folder, sky, number), 1 + stamp_ns(number), "camera")
-    command = ["process", f"{bag}", "--output", f"{folder / 'results'}", "--force"]
+    command = ["process", f"{bag}", "--output", f"{folder / 'results'}", "--force", "--no-report"]
     read_s, process_s, command_s = [], [], []
     for _ in range(2):
         with open_recording(bag) as recording:

@@ -311,9 +311,9 @@ class Pipeline:
                 result.shape,
                 parameters.star_field_model,
                 parameters.outlier_sigmas,
-                len(flow),
             )
-        if motion is None or not motion.is_credible(expected):
+        before, now = len(previous.objects), len(result.objects)
+        if motion is None or not motion.is_credible(expected, before, now):
             return
         inliers = np.zeros(len(flow), bool)
         inliers[valid] = motion.inliers

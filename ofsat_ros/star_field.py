@@ -21,7 +21,7 @@ _VOTE_CELLS = 512
 # A similarity has four parameters; with fewer stars than this their scatter goes into them.
 _STARS_FOR_SIMILARITY = 6
 # Of so many vectors, this part at least must share a motion that is the field's.
-_MANY_TARGETS, _LEAST_SHARE = 20, 0.1
+_MANY_VECTORS, _LEAST_SHARE = 20, 0.1
 # A motion further than this from the expected one, px, needs so many stars, or that part of those
 # that showed the expected one: an RSO that the mount follows and wrong vectors make two or three.
 _OTHER_PX, _ENOUGH_STARS, _ENOUGH_SHARE = 5.0, 5, 0.5
@@ -97,8 +97,14 @@ class StarFieldMotion:
             speed_std=self.speed_std * times,
         )
 
-    def is_credible(self, expected: StarFieldMotion | None) -> bool:
-        """Whether it is about the expected motion, if any, or enough stars show another."""
+    def is_credible(self, expected: StarFieldMotion | None, before: int, now: int) -> bool:
+        """Whether it is about the expected motion, if any, or enough stars show another.
+
+        Not if more stars agree than the frame before showed objects, but few of those of `now`:
+        after a frame in clouds, two or three of a hundred vectors agree by chance.
+        """
+        if before < self.star_count < _LEAST_SHARE * now:
+            return False
         if expected is None or np.hypot(*(self.displacement - expected.displacement)) <= _OTHER_PX:
             return True
         return self.star_count >= min(_ENOUGH_STARS, _ENOUGH_SHARE * expected.star_count)
@@ -122,7 +128,6 @@ def estimate_motion(
     shape: tuple[int, int],
     model: str = "similarity",
     outlier_sigmas: float = 2.0,
-    sought: int = 0,
 ) -> StarFieldMotion | None:
     """Find the motion that most vectors share.
 
@@ -139,15 +144,12 @@ def estimate_motion(
         mean: the mean after outliers of speed are removed, as published (AAS 21-364).
     outlier_sigmas : float
         What the model mean removes, in std.
-    sought : int
-        Targets whose flow was looked for, those without a valid vector included: after a frame
-        that showed nothing, two or three of a hundred stars agree by chance.
 
     Returns
     -------
     StarFieldMotion or None
         None if there is no vector, no two that agree where there are several, or fewer than a
-        tenth of many targets.
+        tenth of many.
     """
     if not len(position):
         return None
@@ -158,8 +160,7 @@ def estimate_motion(
     if len(position) > 1 and np.count_nonzero(inliers) < 2:
         return None
     motion = _robust_fit(position - centre, displacement, sigma, speed, centre, inliers, model)
-    many = max(len(position), sought)
-    few = many >= _MANY_TARGETS and motion.star_count < _LEAST_SHARE * many
+    few = len(position) >= _MANY_VECTORS and motion.star_count < _LEAST_SHARE * len(position)
     return None if few else motion
 
 

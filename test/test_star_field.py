@@ -251,8 +251,13 @@ def test_another_motion_than_expected_needs_stars(before, now, moved, credible):
         for count, shift in ((before, (36, -18)), (now, (36 - moved, -18)))
     )
     assert (expected.star_count, motion.star_count) == (before, now)
-    assert motion.is_credible(expected) is credible
-    assert motion.is_credible(None) is True
+    assert motion.is_credible(expected, before=100, now=100) is credible
+    assert motion.is_credible(None, before=100, now=100) is True
+    # More stars than the frame before showed objects, and few of those of this one: chance.
+    count = motion.star_count
+    assert motion.is_credible(None, before=count - 1, now=11 * count) is False
+    assert motion.is_credible(None, before=count - 1, now=10 * count) is True
+    assert motion.is_credible(None, before=count, now=11 * count) is True
 
 
 # --- first guess ------------------------------------------------------------------------------
