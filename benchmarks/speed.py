@@ -295,10 +295,10 @@ def _other_rows(folder: Path, largest: Sky, bag: Sky, memory_frames: int) -> Ite
     import_s = start_s("import ofsat_ros.pipeline")
     first = "import numpy; Pipeline().process(numpy.eye(1024, dtype='u2'), 0)"
     first_s = start_s(f"from ofsat_ros.pipeline import Pipeline; {first}")
-    others_s = start_s("import numpy, cv2, scipy.spatial, scipy.optimize")
+    others_s = start_s("import numpy, cv2")
     yield (
         f"| a fresh Python: `import ofsat_ros.pipeline` | {import_s:.2f} s, of which Python,"
-        f" NumPy, OpenCV and SciPy take {others_s:.2f} s |"
+        f" NumPy and OpenCV take {others_s:.2f} s |"
     )
     yield f"| a fresh Python to `Pipeline`'s first answer, 1024x1024 | {first_s:.2f} s |"
     prepared = 6
