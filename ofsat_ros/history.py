@@ -57,6 +57,8 @@ class PastFrame:
         Homogeneous matrices from px to the sky plane, and back.
     bright : (M,) intp
         Flat indices, ascending, of the pixels that spots may be made of.
+    blind : (H, W) bool or None
+        Pixels that show no sky; None if all do.
     """
 
     number: int
@@ -68,6 +70,7 @@ class PastFrame:
     regions: Regions
     to_sky: Array
     bright: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
+    blind: NDArray[np.bool_] | None = None
     from_sky: Array = field(init=False)
 
     def __post_init__(self) -> None:
@@ -111,6 +114,11 @@ class PastFrame:
         across = (x >= margin) & (x <= width - 1 - margin)
         return across & (y >= margin) & (y <= height - 1 - margin)
 
+    def light_at(self, xy: Array) -> Array:
+        """Brightness of `smoothed` at points (N, 2) px, by cubic interpolation, (N,) DN."""
+        x, y = np.ascontiguousarray(xy.T, np.float32)
+        return interpolate(self.smoothed, x, y, cv2.INTER_CUBIC).astype(np.float64)
+
     def seen_by(self, others: Sequence[PastFrame], xy: NDArray[Any]) -> tuple[Plane, Plane, Plane]:
         """How other frames show the places of the sky at points of this one.
 
@@ -125,7 +133,7 @@ class PastFrame:
         -------
         brightness : (F, N) float32
             Smoothed brightness by cubic interpolation, DN; NaN within 2 px of the border and
-            outside, where there is nothing to interpolate between.
+            outside, where there is nothing to interpolate between, and where a frame is blind.
         x, y : (F, N) float32
             Where the points are in each, px.
         """
@@ -148,6 +156,11 @@ class PastFrame:
             ]
         )
         brightness[outside] = np.nan
+        for row, other in enumerate(others):
+            if other.blind is not None:
+                seen = np.flatnonzero(~outside[row])
+                places = np.rint(np.stack([y[row, seen], x[row, seen]])).astype(np.intp)
+                brightness[row, seen[other.blind[*places]]] = np.nan
         return brightness, x, y
 
     def noise_at(self, pixels: NDArray[np.intp]) -> Array:
@@ -212,18 +225,20 @@ class History:
         """All frames but this one, oldest first."""
         return [other for other in self._frames if other is not frame]
 
-    def place(self, motion: StarFieldMotion | None) -> Array:
+    def place(self, motion: StarFieldMotion | None, since: Array | None = None) -> Array:
         """Matrix from px of a new frame to the sky plane, (3, 3).
 
         Parameters
         ----------
         motion : StarFieldMotion or None
-            Motion of the field from the newest frame to the new one; None for the first frame,
+            Motion of the field from an earlier frame to the new one; None for the first frame,
             or to assume that the field did not move.
+        since : (3, 3) float64, optional
+            Matrix of the earlier frame; default: of the newest one.
         """
         if not self._frames:
             return np.eye(3)
-        last = self._frames[-1].to_sky
+        last = self._frames[-1].to_sky if since is None else since
         return last if motion is None else last @ _backwards(motion)
 
 

@@ -26,7 +26,7 @@ OBJECT_DTYPE = np.dtype(
         ("length", "f8"),  # length of the streak, px; 0 for a round object
         ("angle", "f8"),  # direction of the streak, rad from x to y, within (-pi/2, pi/2]
         ("area", "i4"),  # px
-        ("edge", "?"),  # the region touches the border of the image
+        ("edge", "?"),  # the region touches the border of the image, or what shows no sky
     ]
 )
 
@@ -46,6 +46,7 @@ def find_objects(
     noise_ratio: NDArray[np.float32],
     min_area_px: int = 1,
     max_objects: int = 5000,
+    blind: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.void], Regions]:
     """Measure the connected regions of the pixels above the threshold.
 
@@ -75,6 +76,8 @@ def find_objects(
         Smaller regions are left out.
     max_objects : int
         The regions with the largest SNR are kept.
+    blind : (H, W) bool, optional
+        Pixels that show no sky: they cut objects as the border does.
 
     Returns
     -------
@@ -118,6 +121,8 @@ def find_objects(
         objects[name] = np.sqrt(2 * moment * moments["untruncated"]) / np.maximum(snr, 1)
     objects["length"], objects["angle"] = _streak(moments, snr)
     at_border = (x == 0) | (y == 0) | (x == shape[1] - 1) | (y == shape[0] - 1)
+    if blind is not None:
+        at_border |= blind[y, x]
     objects["edge"][region[at_border]] = True
     owner = np.full(count, -1)
     owner[order] = np.arange(order.size)

@@ -15,8 +15,17 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from ofsat_ros.comparison import (
+    Seen,
+    find_motion,
+    is_near,
+    measure_flow,
+    why_another_field,
+    why_not_comparable,
+)
 from ofsat_ros.detection import (
     DETECTION_DTYPE,
+    Drift,
     detect,
     find_drifting,
     find_spots,
@@ -25,11 +34,12 @@ from ofsat_ros.detection import (
 )
 from ofsat_ros.history import History, PastFrame
 from ofsat_ros.objects import OBJECT_DTYPE, find_objects
-from ofsat_ros.optical_flow import Flow, FlowInput, flow_engine
+from ofsat_ros.optical_flow import Flow, FlowInput
 from ofsat_ros.parameters import Parameters
-from ofsat_ros.pixels import Regions
-from ofsat_ros.preprocessing import Preprocessed, SensorMemory, preprocess
-from ofsat_ros.star_field import StarFieldMotion, estimate_motion, vote_shift
+from ofsat_ros.pixels import Regions, rows_and_columns
+from ofsat_ros.preprocessing import Preprocessed, SensorMemory, blank_words, preprocess
+from ofsat_ros.star_field import StarFieldMotion
+from ofsat_ros.timeline import Timeline
 from ofsat_ros.tracking import TRACK_DTYPE, Settled, Tracker
 
 _SMALLEST_SIDE = 16
@@ -38,8 +48,6 @@ _DTYPES = ("uint8", "uint16", "float32")
 _CLOSER_SIGMAS, _CLOSER_PX = 2.0, 2
 # Frames in a row over which the field's motion is taken to go on when too few stars show it.
 _BLIND_FRAMES = 3
-# Images that were preprocessed differently cannot be compared.
-_PREPROCESSING = [p.name for p in Parameters.describe() if p.stage == "preprocessing"]
 
 
 class ImageError(ValueError):
@@ -115,17 +123,6 @@ class FrameResult:
         return np.flatnonzero(self.star_field.inliers & ~of_rso)
 
 
-@dataclass(frozen=True)
-class _Previous:
-    """What is kept of the previous frame."""
-
-    stamp_ns: int
-    dtype: np.dtype
-    parameters: Parameters
-    objects: NDArray[np.void]
-    flow_input: FlowInput
-
-
 class Pipeline:
     """Detect RSOs in a sequence of images.
 
@@ -145,7 +142,8 @@ class Pipeline:
 
     def __init__(self, parameters: Parameters | None = None) -> None:
         self.parameters = parameters or Parameters.preset()
-        self._previous: _Previous | None = None
+        self._previous: Seen | None = None
+        self._timeline = Timeline()
         self._sensor = SensorMemory()
         self._history = History(self.parameters.history_frames)
         look = partial(spot_near, radius_px=_CLOSER_PX, least_sigmas=_CLOSER_SIGMAS)
@@ -155,15 +153,19 @@ class Pipeline:
         self._spare: NDArray[np.float32] | None = None
         # The field's last motion, per second.
         self._field_rate: StarFieldMotion | None = None
+        # Where on the sky the previous frame is, and the tracks of the last one, with its stamp.
+        self._since: NDArray[np.float64] | None = None
+        self._tracks = np.zeros(0, TRACK_DTYPE), 0
+        # Frames in a row that show no star field.
         self._blind = 0
         self._reset_reason = "first frame"
         self._frames = 0
 
     def reset(self, reason: str = "reset asked for") -> None:
         """Forget all frames and end all tracks; the next frame starts afresh and says `reason`."""
-        self._previous = None
-        self._forget()
+        self._previous, self._blind = None, 0
         self._reset_reason = reason
+        self._forget()
 
     def finish(self) -> list[Settled]:
         """Say the last word on the frames that it was not said of yet, and start afresh."""
@@ -174,9 +176,12 @@ class Pipeline:
 
     def _forget(self) -> None:
         """End all tracks and drop the history; the last word on it goes with the next frame."""
-        self._settled += self._tracker.clear(self._history)
-        self._history.clear()
-        self._field_rate = None
+        try:
+            self._settled += self._tracker.clear(self._history)
+        finally:
+            self._history.clear()
+            self._field_rate = self._since = None
+            self._tracks = np.zeros(0, TRACK_DTYPE), 0
 
     def process(self, image: NDArray[np.generic], stamp_ns: int) -> FrameResult:
         """Process the next image.
@@ -195,25 +200,33 @@ class Pipeline:
         Raises
         ------
         ImageError
-            If the image has another type or shape, or no finite pixel.  The previous frame stays
-            as it was.
+            If the image has another type or shape, or no finite pixel, or its stamp is astray
+            (`Timeline`).  The previous frame stays as it was.
         """
         _check(image)
+        try:
+            return self._process(image, stamp_ns)
+        except ImageError:
+            raise
+        except BaseException:
+            # A fault, or Ctrl-C: what is half done must not go on into the next frames.
+            self.reset("an error in the frame before")
+            raise
+
+    def _process(self, image: NDArray[np.generic], stamp_ns: int) -> FrameResult:
         parameters = self.parameters
         result = FrameResult(stamp_ns, self._frames, (image.shape[0], image.shape[1]))
         # Given away: what is in it from now on is this frame's.
         spare, self._spare = self._spare, None
         with _timed(result.seconds, "preprocessing"):
             try:
+                self._follow(stamp_ns)
                 pre = preprocess(image, parameters, self._sensor, spare)
             except ValueError as error:
                 raise ImageError(str(error)) from error
         self._frames += 1
-        result.background, result.noise, result.threshold = (
-            pre.background,
-            pre.noise,
-            pre.threshold,
-        )
+        result.background, result.noise = pre.background, pre.noise
+        result.threshold = pre.threshold
         with _timed(result.seconds, "objects"):
             result.objects, regions = find_objects(
                 pre.above,
@@ -224,18 +237,22 @@ class Pipeline:
                 pre.noise_ratio,
                 parameters.min_area_px,
                 parameters.max_objects,
+                pre.blind,
             )
         xy, sigma = _pairs(result.objects, "x", "y"), _pairs(result.objects, "sigma_x", "sigma_y")
         length = result.objects["length"]
-        current = FlowInput(
+        flow_input = FlowInput(
             pre.smoothed, pre.above, pre.pedestal, regions, xy, sigma, length, pre.noise
         )
-
-        previous = self._usable_previous(image, stamp_ns, parameters)
+        current = Seen(stamp_ns, image.dtype, parameters, result.objects, flow_input)
+        if self._previous is not None and (why := why_not_comparable(self._previous, current)):
+            self.reset(why)
+        if self._previous is not None:
+            self._compare(self._previous, current, result, parameters)
         result.reset, self._reset_reason = self._reset_reason, ""
-        if previous is not None:
-            result.dt_s = (stamp_ns - previous.stamp_ns) / 1e9
-            self._compare(previous, current, result, parameters)
+        # What shows no stars is no frame to compare with, unless it goes on for long.
+        blind = self._previous is not None and (pre.veiled or result.star_field is None)
+        self._blind = self._blind + 1 if blind else 0
         if parameters.rso_test == "history":
             self._remember(pre, regions, result, parameters)
             self._track(pre.defects, result, parameters)
@@ -243,82 +260,37 @@ class Pipeline:
             self._forget()
             self._settled.append(Settled(result.frame, stamp_ns, result.detections))
         result.settled, self._settled = self._settled, []
-        self._previous = _Previous(stamp_ns, image.dtype, parameters, result.objects, current)
-        result.reason = _why_nothing(result)
+        if not 0 < self._blind <= _BLIND_FRAMES:
+            self._previous = current
+            self._since = self._history[-1].to_sky if len(self._history) else None
+        result.reason = _why_nothing(result, image, pre.veiled)
         return result
 
-    def _usable_previous(
-        self, image: NDArray[np.generic], stamp_ns: int, parameters: Parameters
-    ) -> _Previous | None:
-        """The previous frame, or None with the reason in `_reset_reason`."""
-        previous = self._previous
-        if previous is None:
-            return None
-        before, now = previous.flow_input.smoothed.shape, image.shape
-        dt_s = (stamp_ns - previous.stamp_ns) / 1e9
-        max_gap_s = parameters.max_gap_s
-        changed = [
-            name
-            for name in _PREPROCESSING
-            if getattr(parameters, name) != getattr(previous.parameters, name)
-        ]
-        if before != now:
-            self.reset(
-                f"the image's size changed from {before[1]}x{before[0]} to {now[1]}x{now[0]}"
-            )
-        elif previous.dtype != image.dtype:
-            self.reset(f"the image's type changed from {previous.dtype} to {image.dtype}")
-        elif dt_s == 0:
-            self.reset("two frames have the same stamp")
-        elif dt_s < 0:
-            self.reset(f"time ran backwards by {-dt_s:g} s")
-        elif dt_s > max_gap_s:
-            self.reset(f"a gap of {dt_s:g} s is longer than max_gap_s = {max_gap_s:g} s")
-        elif changed:
-            self.reset(f"{' and '.join(changed)} changed")
-        return self._previous
+    def _follow(self, stamp_ns: int) -> None:
+        """Refuse a stamp that is astray; start afresh where time has jumped."""
+        if self._previous is None:
+            self._timeline = Timeline()
+        if jump_s := self._timeline.follow(stamp_ns):
+            how = "jumped ahead" if jump_s > 0 else "ran backwards"
+            self.reset(f"time {how} by {abs(jump_s):g} s")
 
     def _compare(
-        self, previous: _Previous, current: FlowInput, result: FrameResult, parameters: Parameters
+        self, previous: Seen, current: Seen, result: FrameResult, parameters: Parameters
     ) -> None:
-        """Fill in flow, star field and detections."""
-        expected = self._field_rate and self._field_rate.over(result.dt_s)
-        guesses = np.zeros((1, 2))
-        if parameters.first_guess == "field":
-            with _timed(result.seconds, "star_field"):
-                shift = vote_shift(
-                    previous.flow_input.xy,
-                    previous.objects["flux"],
-                    current.xy,
-                    result.objects["flux"],
-                )
-            if shift is None and expected is not None:
-                # Too few votes to tell from chance: a mount most likely goes on as it did.
-                shift = expected.displacement
-            if shift is not None:
-                # No motion comes second: in rate tracking the RSOs stand still.
-                guesses = np.stack([shift, np.zeros(2)])
+        """Fill in flow, star field and detections; start afresh if it is another field."""
+        dt_s = (current.stamp_ns - previous.stamp_ns) / 1e9
+        expected = self._field_rate and self._field_rate.over(dt_s)
         with _timed(result.seconds, "optical_flow"):
-            flow = flow_engine(parameters).measure(previous.flow_input, current, guesses)
-        result.flow = flow
+            flow = measure_flow(previous, current, expected, parameters)
         with _timed(result.seconds, "star_field"):
-            valid = flow.valid
-            motion = estimate_motion(
-                flow.position[valid],
-                flow.displacement[valid],
-                flow.sigma[valid],
-                flow.speed_mean[valid],
-                result.shape,
-                parameters.star_field_model,
-                parameters.outlier_sigmas,
-            )
-        before, now = len(previous.objects), len(result.objects)
-        if motion is None or not motion.is_credible(expected, before, now):
-            return
-        inliers = np.zeros(len(flow), bool)
-        inliers[valid] = motion.inliers
-        result.star_field = motion.with_inliers(inliers)
-        if parameters.rso_test == "history":
+            motion = find_motion(flow, previous, current, expected, parameters)
+        if motion is None:
+            known = self._places_expected(current.stamp_ns)
+            if why := why_another_field(previous, current, known):
+                self.reset(why)
+                return
+        result.dt_s, result.flow, result.star_field = dt_s, flow, motion
+        if motion is None or parameters.rso_test == "history":
             return
         with _timed(result.seconds, "detection"):
             result.detections = detect(
@@ -326,30 +298,36 @@ class Pipeline:
                 flow,
                 motion,
                 previous.flow_input,
-                current,
-                result.dt_s,
+                current.flow_input,
+                dt_s,
                 parameters.rso_test,
                 parameters.rso_sigmas,
                 parameters.min_relative_px,
             )
 
+    def _places_expected(self, stamp_ns: int) -> NDArray[np.float64]:
+        """Where the tracks are if all goes on as it did, (K, 2) px."""
+        tracks, since_ns = self._tracks
+        seconds = (stamp_ns - since_ns) / 1e9
+        return _pairs(tracks, "x", "y") + seconds * _pairs(tracks, "vx", "vy")
+
     def _remember(
-        self,
-        pre: Preprocessed,
-        regions: Regions,
-        result: FrameResult,
-        parameters: Parameters,
+        self, pre: Preprocessed, regions: Regions, result: FrameResult, parameters: Parameters
     ) -> None:
         """Add the frame to the history, at its place on the sky."""
         if parameters.history_frames != self._history.length:
             old, self._history = self._history, History(parameters.history_frames)
             # This frame needs a place, too.
             leaving = max(0, len(old) + 1 - parameters.history_frames)
-            self._settled += self._tracker.settle(old, leaving)
+            self._tracker.settle(old, leaving)
             for frame in old:
                 self._history.add(frame)
-        motion = result.star_field
-        self._blind = 0 if motion is not None else self._blind + 1
+        motion, bright = result.star_field, pre.bright
+        if self._blind:
+            # Where it is on the sky is a guess: it goes on with tracks, and shows nothing new.
+            y, x = rows_and_columns(bright, result.shape[1])
+            known = self._places_expected(result.stamp_ns)
+            bright = bright[is_near(np.stack([x, y], axis=1).astype(float), known)]
         if self._blind > _BLIND_FRAMES:
             # Where the stars went meanwhile is not known: what follows is another sky.
             self._forget()
@@ -357,9 +335,10 @@ class Pipeline:
             self._field_rate = motion.over(1 / result.dt_s)
         elif self._field_rate is not None:
             motion = self._field_rate.over(result.dt_s)
-        to_sky = self._history.place(motion)
-        full = len(self._history) == self._history.length
-        self._spare = self._history[0].smoothed if full else None
+        to_sky = self._history.place(motion, self._since)
+        leaves = self._history[0].smoothed if len(self._history) == self._history.length else None
+        # While no stars are seen, frames are compared with one that may have left.
+        self._spare = None if self._blind else leaves
         self._history.add(
             PastFrame(
                 number=result.frame,
@@ -369,7 +348,8 @@ class Pipeline:
                 noise_ratio=pre.noise_ratio,
                 objects=result.objects,
                 regions=regions,
-                bright=pre.bright,
+                bright=bright,
+                blind=pre.blind,
                 to_sky=to_sky,
             )
         )
@@ -391,14 +371,20 @@ class Pipeline:
             tracked = self._tracker.update(
                 history,
                 spots,
-                partial(find_drifting, history, log_limit),
+                _nothing_new if self._blind else partial(find_drifting, history, log_limit),
                 defects,
                 log_limit,
                 parameters.max_speed_px,
                 parameters.coast_frames,
             )
         result.detections, result.tracks = tracked.detections, tracked.tracks
+        self._tracks = tracked.tracks, result.stamp_ns
         self._settled += tracked.settled
+
+
+def _nothing_new(_: NDArray[np.intp]) -> list[Drift]:
+    """Find no drifts: among stars whose place is a guess, all drift."""
+    return []
 
 
 def _check(image: NDArray[np.generic]) -> None:
@@ -424,21 +410,23 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start
 
 
-def _why_nothing(result: FrameResult) -> str:
+def _why_nothing(result: FrameResult, image: NDArray[np.generic], veiled: bool) -> str:
     """In words, why the frame has no detection."""
     if len(result.detections):
         return ""
+    if veiled:
+        return "most of the image is structure, not noise: clouds or bands hide what is faint"
     if not len(result.objects):
-        return "no object is above the threshold"
+        return blank_words(image) or "no object is above the threshold"
     if result.reset:
         return f"no previous frame to compare with: {result.reset}"
     valid = int(np.count_nonzero(result.flow.valid))
     if not valid:
         return f"none of {len(result.objects)} objects was found in the previous frame"
-    if result.star_field is None:
-        return f"the {valid} flow vectors do not agree on a motion of the star field"
     if valid == 1:
         return "only one object was found in the previous frame: no star field to compare it with"
+    if result.star_field is None:
+        return f"the {valid} flow vectors do not agree on a motion of the star field"
     stars = result.star_field.star_count
     if not result.spot_count:
         return f"everything moves with the star field ({stars} stars)"

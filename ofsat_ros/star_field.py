@@ -25,6 +25,9 @@ _MANY_VECTORS, _LEAST_SHARE = 20, 0.1
 # A motion further than this from the expected one, px, needs so many stars, or that part of those
 # that showed the expected one: an RSO that the mount follows and wrong vectors make two or three.
 _OTHER_PX, _ENOUGH_STARS, _ENOUGH_SHARE = 5.0, 5, 0.5
+# A motion is not believed if two unrelated fields show one more often than this; motions so far
+# apart, px, carry objects to different places.
+_MOST_CHANCE, _APART_PX = 1e-2, 1.5
 # Cut of Tukey's biweight, in sigmas: 95 % efficiency on Gaussian errors.
 _TUKEY = 4.685
 # The fit has converged when no vector of the field changes by more than this, px.
@@ -97,17 +100,51 @@ class StarFieldMotion:
             speed_std=self.speed_std * times,
         )
 
-    def is_credible(self, expected: StarFieldMotion | None, before: int, now: int) -> bool:
-        """Whether it is about the expected motion, if any, or enough stars show another.
+    def is_credible(
+        self,
+        expected: StarFieldMotion | None,
+        objects: tuple[int, int],
+        carried: int,
+        found: int,
+        share: float,
+    ) -> bool:
+        """Whether it is the motion of one field, and not what two unrelated ones show by chance.
 
-        Not if more stars agree than the frame before showed objects, but few of those of `now`:
-        after a frame in clouds, two or three of a hundred vectors agree by chance.
+        Parameters
+        ----------
+        expected : StarFieldMotion or None
+            The motion if it goes on as it did; another one needs more stars.
+        objects : (int, int)
+            Objects of the frame before, and of this one.
+        carried, found : int
+            Objects of one of the frames that the motion carries into the other, and those of them
+            that it carries onto an object there.
+        share : float
+            Part of the other frame which objects cover.
+
+        Notes
+        -----
+        Chance carries an object onto another with the probability `share`, and `found` of
+        `carried` with at most exp(-`carried` D), where D is the divergence of their share from it
+        (Hoeffding 1963, theorem 1).  It has as many tries as there are motions as near to the
+        expected one, or pairs of objects that may give one; those that gave it are no evidence.
         """
-        if before < self.star_count < _LEAST_SHARE * now:
-            return False
-        if expected is None or np.hypot(*(self.displacement - expected.displacement)) <= _OTHER_PX:
-            return True
-        return self.star_count >= min(_ENOUGH_STARS, _ENOUGH_SHARE * expected.star_count)
+        off_px = np.inf
+        if expected is not None:
+            off_px = float(np.hypot(*(self.displacement - expected.displacement)))
+        if off_px <= _OTHER_PX:
+            tries = max(1.0, (off_px / _APART_PX) ** 2)
+        else:
+            if expected is not None and self.star_count < min(
+                _ENOUGH_STARS, _ENOUGH_SHARE * expected.star_count
+            ):
+                return False
+            if found == max(objects) == self.star_count:
+                return True  # all there is agrees, be it a single star
+            given = 2 if self.model == "similarity" else 1
+            tries = float(max(1, objects[0] * objects[1])) ** given
+            carried, found = carried - given, found - given
+        return bool(np.log(tries) + _log_chance(found, carried, share) < np.log(_MOST_CHANCE))
 
     def displacement_at(self, xy: Array) -> Array:
         """Displacement of the field at points (N, 2) px of the current frame, (N, 2) px."""
@@ -323,6 +360,15 @@ def _robust_fit(
         speed_std=float(speed[inliers].std()),
         model="similarity" if used == 4 else "shift",
     )
+
+
+def _log_chance(found: int, of: int, share: float) -> float:
+    """Logarithm of the bound on the probability of at least `found` of `of`, each with `share`."""
+    if found <= 0 or found <= share * of:
+        return 0.0
+    part, share = found / of, max(share, 1e-12)
+    missing = 0.0 if found == of else (1 - part) * np.log((1 - part) / (1 - share))
+    return float(-of * (part * np.log(part / share) + missing))
 
 
 def _design(offset: Array) -> Array:

@@ -246,7 +246,7 @@ def test_frames_are_counted_and_timed():
     assert math.isnan(results[0].dt_s)
     assert [r.dt_s for r in results[1:]] == [0.5] * 3
     assert {r.shape for r in results} == {(SIZE, SIZE)}
-    stages = ["preprocessing", "objects", "star_field", "optical_flow", "detection", "tracking"]
+    stages = ["preprocessing", "objects", "optical_flow", "star_field", "detection", "tracking"]
     assert list(results[0].seconds) == stages[:2]
     assert list(results[1].seconds) == stages
     assert all(0 < s < 10 for s in results[1].seconds.values())
@@ -414,12 +414,6 @@ RESETS = {
         stamp(1),
         "the image's type changed from uint16 to float32",
     ),
-    "same stamp": (lambda: as16(SURVEY.image(1)), stamp(0), "two frames have the same stamp"),
-    "backwards": (
-        lambda: as16(SURVEY.image(1)),
-        stamp(0) - 2_500_000_000,
-        "time ran backwards by 2.5 s",
-    ),
     "gap": (
         lambda: as16(SURVEY.image(1)),
         stamp(0) + 60_000_000_001,
@@ -539,7 +533,9 @@ def test_why_nothing_in_the_first_frame():
 
 def test_why_nothing_when_all_is_new():
     found = reasons(sky(), sky((50, 50), (150, 90), (70, 190), seed=2))
-    assert found[1] == "none of 3 objects was found in the previous frame"
+    assert found[1] == f"{FIRST}the frame before showed no star field"
+    found = reasons(sky(), sky((50, 50), (150, 90), seed=2))
+    assert found[1] == "none of 2 objects was found in the previous frame"
 
 
 def test_why_nothing_when_all_moves_alike():
@@ -568,8 +564,8 @@ def test_why_nothing_with_one_object():
 
 
 def test_why_nothing_when_no_two_agree():
-    steps = [(4, 0), (-4, 0), (0, 4), (0, -4)]
-    places = [(50, 50), (150, 60), (60, 180), (190, 200)]
+    steps = [(4, 0), (-4, 0)]
+    places = [(50, 50), (150, 60)]
     moved = [(x + dx, y + dy) for (x, y), (dx, dy) in zip(places, steps, strict=True)]
     pipeline = Pipeline(Parameters(first_guess="zero", window_px=21))
     pipeline.process(sky(*places), stamp(0))
@@ -580,14 +576,16 @@ def test_why_nothing_when_no_two_agree():
 
 
 def test_objects_that_come_back_are_found_again():
-    """A cloud hides all; the frame after it starts from nothing, the next one finds."""
+    """A cloud hides all; the frame after it is compared with the one before it."""
     pipeline = two_frames()
     for frame in range(5):
         image = SURVEY.image(frame)
         if frame == 2:
             image = np.random.default_rng(5).normal(9000, 90, image.shape)
         result = pipeline.process(as16(image), stamp(frame))
-        assert len(result.detections) == (3 if frame in (1, 4) else 0), frame
+        assert len(result.detections) == (3 if frame in (1, 3, 4) else 0), frame
+        if frame == 3:
+            assert result.dt_s == 2 * STEP_NS / 1e9
     assert result.reset == ""
 
 
@@ -602,8 +600,11 @@ def settle(pipeline: Pipeline, images: list[np.ndarray], stamps: list[int]) -> l
         settled += result.settled
         assert len(settled) <= number + 1
         if pipeline.parameters.rso_test == "history":
-            # Those that are not settled yet are still in the history.
-            assert number + 1 - len(settled) < pipeline.parameters.history_frames
+            # Those that are not settled yet are still in the history, or wait for what becomes of
+            # their tracks.
+            parameters = pipeline.parameters
+            waiting = parameters.history_frames + parameters.coast_frames
+            assert number + 1 - len(settled) <= waiting
     settled += pipeline.finish()
     assert pipeline.finish() == []
     assert [one.frame for one in settled] == list(range(len(images)))
@@ -629,10 +630,10 @@ def test_what_is_settled_was_there_before_it_was_confirmed():
         np.testing.assert_allclose(velocity, SURVEY.rso_steps / 0.5, atol=0.05)
 
 
-def test_a_frame_is_settled_when_it_leaves_the_history():
-    results = run(SURVEY, 9, history_frames=4)
+def test_a_frame_is_settled_when_its_tracks_could_have_ended():
+    results = run(SURVEY, 9, history_frames=4, coast_frames=2)
     numbers = [[one.frame for one in result.settled] for result in results]
-    assert numbers == [[], [], [], [0], [1], [2], [3], [4], [5]]
+    assert numbers == [[], [], [], [], [], [], [0], [1], [2]]
 
 
 def test_finish_before_anything_and_a_new_start_after_it():
@@ -649,9 +650,6 @@ def test_finish_before_anything_and_a_new_start_after_it():
 
 
 INTERRUPTIONS = {
-    "gap": lambda image, at: (image, at + 10**12),
-    "backwards": lambda image, at: (image, at - 10**12),
-    "same stamp": lambda image, at: (image, at - STEP_NS),
     "size": lambda image, at: (image[:240], at),
     "type": lambda image, at: (image.astype(np.float32), at),
 }
@@ -731,9 +729,13 @@ def test_the_fields_motion_is_taken_to_go_on_for_three_frames(hidden: range):
         result = pipeline.process(clouded(SURVEY, frame, hidden), stamp(frame))
         if frame < 2:
             continue
-        # The first frame after the cloud shows no motion of the field either.
-        if frame in hidden or frame - 1 in hidden:
+        if frame in hidden:
             assert result.star_field is None
+        elif frame - 1 in hidden:
+            # Compared with the last frame before the cloud.
+            assert result.dt_s == pytest.approx((1 + len(hidden)) * STEP_NS / 1e9)
+            step = (1 + len(hidden)) * SURVEY.star_step
+            assert result.star_field.displacement == pytest.approx(step, abs=0.1)
         tracks = rows_of(SURVEY.rsos_at(frame), result.tracks)
         ids = tracks["track_id"].tolist() if ids is None else ids
         assert tracks["track_id"].tolist() == ids
@@ -810,10 +812,10 @@ def test_an_rso_that_is_followed_is_no_star_field(hidden: int):
     """Alone in the image, it is where it was, and the unseen stars go on as they did."""
     clouds = {6 + i: 0 for i in range(hidden)}
     for result in follow([FAST] * 10, clouds, {}):
-        if result.frame in clouds or result.frame - 1 in clouds:
+        if result.frame in clouds:
             assert result.star_field is None
         elif result.frame:
-            assert result.star_field.displacement == pytest.approx(FAST, abs=0.3)
+            assert result.star_field.displacement == pytest.approx(FAST * result.dt_s, abs=0.3)
 
 
 def test_unseen_stars_go_on_for_as_long_as_the_stamps_say():

@@ -339,13 +339,38 @@ def test_missing_pixels_count_as_background(bad: float):
     assert np.isfinite(pre.smoothed).all()
     assert pre.background == pytest.approx(reference.background, abs=1)
     assert pre.noise == pytest.approx(reference.noise, rel=0.03)
-    assert np.abs(pre.image[200:230, 100:140]).max() < 20
+    # Background with its noise of 20, within three sigmas: without it, the noise would be too low.
+    assert np.abs(pre.image[200:230, 100:140]).max() < 3.2 * 20
+    assert np.std(pre.image[200:230, 100:140]) == pytest.approx(20, rel=0.1)
     assert mask(pre).mean() < 4 * norm.sf(4)
+    # Single pixels hide nothing around them; an area, and what smoothing mixes with it, does.
+    assert pre.blind is not None
+    there = np.argwhere(pre.blind)
+    assert (there.min(axis=0).tolist(), there.max(axis=0).tolist()) == ([195, 95], [234, 144])
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 3e38])
-def test_an_image_without_a_finite_pixel_is_refused(bad: float):
-    with pytest.raises(ValueError, match=r"^no pixel of the image is a finite number$"):
+def test_half_an_image_of_one_value_is_no_sky_and_leaves_the_noise_as_it_is():
+    image = counts(noise())
+    reference = run(image)
+    assert reference.blind is None
+    for value in (0, 65535):
+        image[100:] = value
+        pre = run(image)
+        assert pre.noise == pytest.approx(reference.noise, rel=0.05)
+        assert pre.blind is not None
+        assert np.array_equal(np.flatnonzero(pre.blind.all(axis=1)), np.arange(95, len(image)))
+        assert not pre.veiled
+
+
+@pytest.mark.parametrize(
+    ("bad", "what"),
+    [
+        *((bad, "a finite number") for bad in (np.nan, np.inf, -np.inf)),
+        (3e38, "below 1e15, as DN are"),
+    ],
+)
+def test_an_image_without_a_usable_pixel_is_refused(bad: float, what: str):
+    with pytest.raises(ValueError, match=f"^no pixel of the image is {what}$"):
         run(np.full((32, 32), bad, np.float32))
 
 

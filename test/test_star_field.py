@@ -251,13 +251,45 @@ def test_another_motion_than_expected_needs_stars(before, now, moved, credible):
         for count, shift in ((before, (36, -18)), (now, (36 - moved, -18)))
     )
     assert (expected.star_count, motion.star_count) == (before, now)
-    assert motion.is_credible(expected, before=100, now=100) is credible
-    assert motion.is_credible(None, before=100, now=100) is True
-    # More stars than the frame before showed objects, and few of those of this one: chance.
-    count = motion.star_count
-    assert motion.is_credible(None, before=count - 1, now=11 * count) is False
-    assert motion.is_credible(None, before=count - 1, now=10 * count) is True
-    assert motion.is_credible(None, before=count, now=11 * count) is True
+    # All of its stars are carried onto objects, which cover a thousandth of the other frame.
+    seen = (20, 20), now, now, 1e-3
+    assert motion.is_credible(expected, *seen) is credible
+
+
+def chance(objects, carried, found, share, model="shift", expected=None):
+    """Whether a motion is credible that so many stars of the other frame show."""
+    rng = np.random.default_rng(11)
+    motion = estimate(*vectors(rng, 12, 0.05, [36, -18, 0, 0]), model=model)
+    return motion.is_credible(expected, objects, carried, found, share)
+
+
+@pytest.mark.parametrize(
+    ("objects", "carried", "found", "share", "credible"),
+    [
+        ((400, 400), 390, 350, 0.03, True),  # a field, and another one
+        ((400, 400), 390, 30, 0.03, False),
+        ((400, 10), 10, 8, 0.03, True),  # clouds hide most
+        ((10, 400), 10, 2, 0.03, False),  # 0.3 are found by chance
+        ((3, 3), 3, 3, 1e-3, True),
+        ((3, 3), 3, 2, 5e-3, False),
+        ((30, 30), 2, 2, 1e-3, False),  # a motion out of the image proves nothing
+    ],
+)
+def test_what_two_fields_share_by_chance_is_no_motion(objects, carried, found, share, credible):
+    assert chance(objects, carried, found, share) is credible
+
+
+def test_a_motion_of_more_parameters_needs_more_stars():
+    assert chance((30, 30), 5, 4, 5e-3) is True
+    assert chance((30, 30), 5, 4, 5e-3, "similarity") is False
+
+
+def test_a_motion_as_expected_needs_fewer_stars():
+    expected = estimate(*vectors(np.random.default_rng(1), 12, 0.05, [36.2, -18, 0, 0]))
+    assert chance((30, 30), 20, 2, 1e-3) is False
+    # 0.02 are found by chance
+    assert chance((30, 30), 20, 2, 1e-3, expected=expected) is True
+    assert chance((30, 30), 20, 1, 1e-3, expected=expected) is False
 
 
 # --- first guess ------------------------------------------------------------------------------

@@ -89,7 +89,11 @@ def find_spots(
         return np.zeros(0, SPOT_DTYPE)
     pixels, excess, clean, star = _fresh_pixels(frame, others, spot_sigmas)
     spots = _measure(frame, pixels, excess, clean, star)
-    inside = frame.contains(np.stack([spots["x"], spots["y"]], axis=1), BORDER_PX)
+    xy = np.stack([spots["x"], spots["y"]], axis=1)
+    inside = frame.contains(xy, BORDER_PX)
+    if frame.blind is not None:
+        column, row = np.rint(xy).astype(np.intp).T
+        inside &= ~frame.blind[row, column]
     spots = spots[inside]
     wide = _surroundings(frame, others, spots)
     spots["excess"] -= wide

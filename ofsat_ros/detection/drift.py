@@ -137,6 +137,9 @@ def find_drifting(history: History, log_limit: float, known: Collection[int] = (
     suspect &= rms < np.maximum(0.3, 3 * error)
     suspect &= frame.contains(_xy(frame.objects[followed]), _HALF_PX + 1)
     chosen = np.flatnonzero(suspect)
+    off = lines.at(0.0)[chosen, None] + lines.velocity[chosen, None] * times - places[chosen]
+    misfit = np.sum(np.abs(off) ** 2 * found[chosen], axis=1)
+    chosen = chosen[misfit < _misfit_of_step(places[chosen], found[chosen])]
     if not chosen.size:
         return []
     velocity = _points(lines.velocity[chosen])
@@ -149,6 +152,19 @@ def find_drifting(history: History, log_limit: float, known: Collection[int] = (
         )
         for row in chosen[agrees].tolist()
     ]
+
+
+def _misfit_of_step(places: NDArray[np.complex128], found: Mask) -> Array:
+    """Sum of squares, (N,) px^2, that one jump between two standstills leaves of paths (N, K).
+
+    Where frames were torn or misplaced, the stars jump; what drifts goes evenly.
+    """
+    count, total = found.cumsum(axis=1), places.cumsum(axis=1)
+    left = (np.abs(places) ** 2).sum(axis=1)
+    after = np.maximum(count[:, -1:] - count, 1)
+    explained = np.abs(total) ** 2 / np.maximum(count, 1)
+    explained += np.abs(total[:, -1:] - total) ** 2 / after
+    return left - explained.max(axis=1, initial=0)
 
 
 def _stand_still(frame: PastFrame, earlier: list[PastFrame]) -> tuple[NDArray[np.bool_], float]:
@@ -261,7 +277,9 @@ def _flow_agrees(
     precision = np.linalg.inv(covariance)
 
     def sigmas(vectors: Array) -> Array:
-        return np.sqrt(np.einsum("ni,nij,nj->n", vectors, precision, vectors))
+        squares = np.einsum("ni,nij,nj->n", vectors, precision, vectors)
+        # A rounded inverse of what has a gradient along one axis alone may be a little negative.
+        return np.sqrt(np.maximum(squares, 0))
 
     moved, agreement = np.zeros(found.shape), np.full(found.shape, np.nan)
     moved[which, against] = sigmas(drift)

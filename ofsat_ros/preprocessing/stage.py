@@ -32,8 +32,18 @@ Index = NDArray[np.intp]
 _NOISE_CELLS, _NOISE_SAMPLES = 4, 64
 # Beyond it the squares of float32 overflow; files mark missing pixels by such numbers.
 _LARGEST = 1e15
+# An area of one value is sought if a sample of the image has so much of it, so far from nearly all
+# others, in steps of rounding; it is at least as wide, px.
+_FLAT_SAMPLES, _LEAST_FLAT, _FAR_STEPS, _FLAT_PX = 128, 8, 4.0, 5
+# Values that background is filled in with.
+_FILL_SAMPLES = 2**16
+# Side of the square around a pixel without sky in which smoothing has spread that, px.
+_BLIND_PX = 11
 # Spots are made of pixels above this many sigmas.
 SPOT_PIXEL_SIGMAS = 2.5
+# White noise keeps a third of itself when smoothed, what has structure nearly all: above this part
+# of it, most of the image is structure, be it clouds or a sensor's bands.
+_VEIL_RATIO, _WHITE_RATIO = 0.9, 0.5
 # Pixels of a strip: smaller ones would stay in the processor's own cache, but Python's threads
 # would wait for each other between their many short steps.
 _STRIP_PIXELS, _LEAST_ROWS = 2**20, 64
@@ -68,6 +78,10 @@ class Preprocessed:
         Threshold of `smoothed`, over the background, DN; the median over the image.
     defects : int
         Pixels that the sensor's memory knows as defects.
+    veiled : bool
+        Whether most of the image has a structure that hides what is faint: clouds, bands.
+    blind : (H, W) bool or None
+        Pixels that show no sky, and those that smoothing mixes with them; None if all do.
     """
 
     smoothed: Image
@@ -80,6 +94,8 @@ class Preprocessed:
     noise_ratio: Image
     threshold: float
     defects: int
+    veiled: bool
+    blind: NDArray[np.bool_] | None
     _raw: NDArray[np.generic]
     _levels: BackgroundMap
     _replaced: tuple[Index, Image]
@@ -131,10 +147,15 @@ def preprocess(
     Raises
     ------
     ValueError
-        If no pixel is finite.
+        If no pixel is finite and below 1e15.
     """
-    image = _finite(raw)
+    image, blind = _finite(raw)
     rounding = _rounding_noise(image)
+    flat = _flat(image, rounding * math.sqrt(12)) if blind is None else None
+    blind = flat if blind is None else blind
+    if blind is not None:
+        image = _filled(image, blind)
+        blind = _around(blind)
     cell = parameters.background_cell_px if parameters.background == "mesh" else max(raw.shape)
     # A mesh needs a frame of cells to interpolate between; a small image is one cell.
     mesh = (max(1, round(raw.shape[0] / cell)), max(1, round(raw.shape[1] / cell)))
@@ -149,8 +170,7 @@ def preprocess(
     replaced, defects = _smooth(image, levels, pixel_noise, parameters, memory, smoothed)
 
     sigma = parameters.smoothing_sigma_px
-    # A Gaussian of sigma s lowers white noise to 1 / (2 sqrt(pi) s), if s is not tiny.
-    floor = rounding * (min(1.0, 0.5 / (math.sqrt(math.pi) * sigma)) if sigma > 0 else 1.0)
+    floor = rounding * _white_ratio(sigma)
     count = parameters.threshold_sigmas
     if parameters.threshold_statistics == "all":
         mean, std = (float(v[0, 0]) for v in cv2.meanStdDev(smoothed))
@@ -161,6 +181,8 @@ def preprocess(
         noise = float(np.median(noise_mesh))
         ratio = noise_mesh / np.float32(noise)
         limit = mean_mesh + np.float32(count) * noise_mesh
+    white = _white_ratio(sigma)
+    local = parameters.threshold_statistics == "clipped" and white < _WHITE_RATIO
     bright, light = _bright_pixels(smoothed, np.minimum(limit, SPOT_PIXEL_SIGMAS * noise * ratio))
     return Preprocessed(
         smoothed=smoothed,
@@ -173,6 +195,8 @@ def preprocess(
         noise_ratio=ratio,
         threshold=float(np.median(limit)),
         defects=defects,
+        veiled=local and noise > _VEIL_RATIO * pixel_noise,
+        blind=blind,
         _raw=image,
         _levels=levels,
         _replaced=replaced,
@@ -186,15 +210,67 @@ def _above(bright: Index, light: Image, limit: Image, shape: tuple[int, ...]) ->
     return pixels[light[near] > meshes.sample(limit, *rows_and_columns(pixels, shape[1]), shape)]
 
 
-def _finite(raw: NDArray[np.generic]) -> NDArray[np.generic]:
-    """The image in this machine's byte order, every value and its square finite."""
+def _white_ratio(sigma: float) -> float:
+    """What a Gaussian of sigma s lowers white noise to: 1 / (2 sqrt(pi) s), if s is not tiny."""
+    return min(1.0, 0.5 / (math.sqrt(math.pi) * sigma)) if sigma > 0 else 1.0
+
+
+def _flat(image: NDArray[np.generic], step: float) -> NDArray[np.bool_] | None:
+    """Areas of one value at an end of the range, and far from all others, (H, W); None if none.
+
+    Masks, lost rows, what is saturated.  The black of a compressed sky has others next to it.
+    """
+    some = cv2.resize(image, (_FLAT_SAMPLES, _FLAT_SAMPLES), interpolation=cv2.INTER_NEAREST)
+    flat = np.zeros(image.shape, np.uint8)
+    for end in (some.min(), some.max()):
+        others = some[some != end].astype(np.float64)
+        if not 0 < others.size <= some.size - _LEAST_FLAT:
+            continue
+        spread = np.median(np.abs(others - np.median(others)))
+        if np.percentile(np.abs(others - float(end)), 5) < max(_FAR_STEPS * step, 2 * spread):
+            continue
+        alike = cv2.compare(image, float(end), cv2.CMP_EQ)
+        flat |= cv2.morphologyEx(alike, cv2.MORPH_OPEN, np.ones((_FLAT_PX, _FLAT_PX), np.uint8))
+    return flat > 0 if flat.any() else None
+
+
+def _around(blind: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+    """Areas without sky, and what smoothing mixes with them, (H, W); None if none is as wide.
+
+    A bad pixel here and there takes little from what is around it.
+    """
+    square = np.ones((_FLAT_PX, _FLAT_PX), np.uint8)
+    wide = cv2.morphologyEx(blind.view(np.uint8), cv2.MORPH_OPEN, square)
+    if not wide.any():
+        return None
+    return cv2.dilate(wide, np.ones((_BLIND_PX, _BLIND_PX), np.uint8)) > 0
+
+
+def _filled(image: NDArray[np.generic], blind: NDArray[np.bool_]) -> NDArray[np.generic]:
+    """The image with background, and its noise, where there is no sky."""
+    seen = image[~blind]
+    some = seen[:: 1 + seen.size // _FILL_SAMPLES].astype(np.float64)
+    middle = np.median(some)
+    off = np.abs(some - middle)
+    some = some[off <= 3 * 1.4826 * np.median(off)]
+    filled = image.copy()
+    filled[blind] = np.resize(some, np.count_nonzero(blind))
+    return filled
+
+
+def _finite(raw: NDArray[np.generic]) -> tuple[NDArray[np.generic], NDArray[np.bool_] | None]:
+    """The image in this machine's byte order, every value and its square finite.
+
+    And the pixels that were not, (H, W), None if all were.
+    """
     image = np.ascontiguousarray(raw, raw.dtype.newbyteorder("="))
     if image.dtype.kind != "f" or cv2.checkRange(image, True, -_LARGEST, _LARGEST)[0]:
-        return image
+        return image, None
     usable = np.abs(image) < _LARGEST
     if not usable.any():
-        raise ValueError("no pixel of the image is a finite number")
-    return np.where(usable, image, np.median(image[usable]))
+        what = "below 1e15, as DN are" if np.isfinite(image).any() else "a finite number"
+        raise ValueError(f"no pixel of the image is {what}")
+    return np.where(usable, image, image[usable].min()), ~usable
 
 
 def _rounding_noise(image: NDArray[np.generic]) -> float:

@@ -155,6 +155,14 @@ class Track:
         for hit in hits[1:]:
             _update([self], [hit])
 
+    def go_on_from(self, before: Track) -> None:
+        """Be the same RSO as a track that has ended; where both have a hit, its own counts."""
+        self.track_id, self.born_ns = before.track_id, before.born_ns
+        self.missed += before.missed
+        new = sum(number not in before.hits for number in self.hits)
+        self.hit_count = self.born_hits = before.hit_count + new
+        self.hits = {**before.hits, **self.hits}
+
     def velocity_near(self, number: int) -> Array:
         """Velocity in the sky plane around a frame, (2,) px/s: of a line through the nearest hits.
 

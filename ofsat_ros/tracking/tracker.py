@@ -16,10 +16,14 @@ from numpy.typing import NDArray
 
 from ofsat_ros.detection import BORDER_PX, CANDIDATE, CONFIRMED, DETECTION_DTYPE, SPOT_DTYPE, Drift
 from ofsat_ros.history import History, PastFrame
+from ofsat_ros.tracking.assignment import SLOW_PX, as_spots, assign
+from ofsat_ros.tracking.last_word import LastWord
 from ofsat_ros.tracking.linking import find_links
-from ofsat_ros.tracking.rows import TRACK_DTYPE, Settled, detection_rows, settled_rows, track_rows
+from ofsat_ros.tracking.rows import TRACK_DTYPE, Settled, detection_rows, track_rows
+from ofsat_ros.tracking.sharpness import is_sharper_than_stars
 from ofsat_ros.tracking.sightings import Sighting, as_complex
-from ofsat_ros.tracking.track import Hit, Track, add_hits, covariances, places, predict
+from ofsat_ros.tracking.staying import moves_on
+from ofsat_ros.tracking.track import Hit, Track, add_hits, places, predict
 
 Array = NDArray[np.float64]
 # Looks in a frame, compared with others, near a point: none or one SPOT_DTYPE.
@@ -33,29 +37,18 @@ Refine = Callable[
 # Finds objects of the newest frame that drift, beside those of known rows.
 FindDrifts = Callable[[NDArray[np.intp]], Sequence[Drift]]
 
-# A spot this far from where a track is expected, in sigmas, is not its.
-_GATE_SIGMAS = 4.0
-# Beside the track's own uncertainty, px: what noise moves a faint spot by.
-_SPREAD_PX = 0.35
-# An object may be a slow track's sight; a fast track would take a star for it, px per frame.
-_SLOW_PX = 2.0
-_FLUX_RATIO = 3.0
-# What is longer than the track by more than some such steps has grown together with a star, px.
-_LONGER_PX = 1.5
 # Spots this near to a track's are pieces of it, px beside its streak.
 _PIECE_PX = 2.5
 # A track whose hits are longer is a streak, whose ends its centroid needs, px.
 _LONGEST_POINT_PX = 4.0
 # Where a track is expected less surely than this, nothing faint is looked for, px.
 _SURE_PX = 1.5
+# What is fainter than the track by more than this is noise, or a cloud has hidden it.
+_FADED = 5.0
 # A spot fainter than this has a poor place of its own, sigmas.
 _FAINT_SIGMAS = 4.0
 # What is left of a star beside a spot may pull it by this, px.
 _PULLED_PX = 1.0
-# Farther from where it is expected, beyond half of what it moves in a frame, it is not sought, px.
-_FARTHEST_PX = 50.0
-# The distance of what cannot be.
-_NEVER = 1e6
 # A frame in which the track itself was as near as this doesn't show what is behind it, px.
 _SELF_PX = 2.5
 # Nor one in which its wings reach what is measured.
@@ -102,16 +95,18 @@ class Tracker:
         self._ended: list[Track] = []
         self._sightings: list[Sighting] = []
         self._last_id = 0
-        self._next_to_settle = 0
+        self._last_word = LastWord()
 
     def clear(self, history: History) -> list[Settled]:
         """End all tracks and return what is said last of the history's frames.
 
         The ids are not used again.
         """
-        settled = self.settle(history, len(history))
-        self._tracks, self._ended, self._sightings = [], [], []
-        return settled
+        try:
+            self.settle(history, len(history))
+        finally:
+            self._tracks, self._ended, self._sightings = [], [], []
+        return self._last_word.said()
 
     def update(
         self,
@@ -164,23 +159,18 @@ class Tracker:
         rows = track_rows(self._tracks, history)
         # The oldest frame makes room for the next one.
         full = len(history) == history.length
-        settled = self.settle(history, 1) if full else []
+        if full:
+            self.settle(history, 1)
         for track in self._tracks:
             track.forget(oldest - history.length)
         self._ended = [track for track in self._ended if max(track.hits) > oldest]
+        # By then, a track that has not been seen since its birth has ended.
+        settled = self._last_word.said(oldest - coast_frames)
         return Tracked(np.concatenate(now), rows, settled)
 
-    def settle(self, history: History, count: int) -> list[Settled]:
-        """Say the last word on the oldest frames, this many, that it was not said of before."""
-        settled = []
-        for frame in list(history)[:count]:
-            if frame.number < self._next_to_settle:
-                continue
-            self._next_to_settle = frame.number + 1
-            tracks = [t for t in (*self._ended, *self._tracks) if frame.number in t.hits]
-            detections = settled_rows(tracks, frame, history)
-            settled.append(Settled(frame.number, frame.stamp_ns, detections))
-        return settled
+    def settle(self, history: History, count: int) -> None:
+        """Write down what will be said last of the oldest frames, this many: they are leaving."""
+        self._last_word.take(history, count, (*self._ended, *self._tracks))
 
     def _known_objects(self, frame: PastFrame) -> NDArray[np.intp]:
         """Rows of the objects that tracks took in a frame."""
@@ -192,7 +182,7 @@ class Tracker:
         """Give each track its spot of the newest frame, and end those that are gone."""
         frame, sighting = history[-1], self._sightings[-1]
         inside = frame.contains(places(self._tracks, frame))
-        rows, spots = self._assign(frame, sighting)
+        rows, spots = assign(self._tracks, frame, sighting)
         taken = list(np.stack([spots["x"], spots["y"]], axis=1))
         sure = [self._tracks[row] for row in rows]
         hits = self._refined(sure, frame, history, spots)
@@ -211,35 +201,15 @@ class Tracker:
                 hits.append(hit)
         kept = []
         for track, seen in zip(self._tracks, inside, strict=True):
-            if track.stands_still():
-                continue
-            if seen and track.misses <= coast_frames:
+            star = track.stands_still()
+            if seen and track.misses <= coast_frames and not star:
                 kept.append(track)
-            elif track.is_sustained(log_limit):
+            elif track.is_sustained(log_limit) and not star:
                 self._ended.append(track)
+            else:
+                self._last_word.withdraw(track.track_id)
         _take(sighting, hits)
         self._tracks = kept
-
-    def _assign(
-        self, frame: PastFrame, sighting: Sighting
-    ) -> tuple[NDArray[np.intp], NDArray[np.void]]:
-        """Rows of tracks, and the spot of each, such that their distances are least in all."""
-        if not self._tracks:
-            return np.zeros(0, np.intp), np.zeros(0, SPOT_DTYPE)
-        from scipy.optimize import linear_sum_assignment  # no frame without tracks waits for it
-
-        row, column, spots, distance = _candidates(self._tracks, frame, sighting)
-        # What is beyond the gate must not weigh in what others get.
-        good = np.flatnonzero(distance < _GATE_SIGMAS**2)
-        row = row[good]
-        columns, column = np.unique(column[good], return_inverse=True)
-        cost = np.full((len(self._tracks), len(columns)), _NEVER)
-        cost[row, column] = distance[good]
-        candidate = np.full(cost.shape, -1)
-        candidate[row, column] = good
-        row, column = linear_sum_assignment(cost)
-        best = candidate[row, column]
-        return row[best >= 0], spots[best[best >= 0]]
 
     def _closer_look(
         self, track: Track, frame: PastFrame, history: History, taken: list[Array]
@@ -263,6 +233,8 @@ class Tracker:
         xy = np.array([spot["x"], spot["y"]])
         if any(np.hypot(*(xy - other)) < _PIECE_PX for other in taken):
             return None
+        if spot["flux"] * _FADED < track.flux:
+            return None
         hit = Hit.of(frame, spot)
         if hit.spot["excess"] < _FAINT_SIGMAS or not spot["clean"]:
             own = hit.covariance + (0 if spot["clean"] else _PULLED_PX**2) * np.eye(2)
@@ -285,7 +257,7 @@ class Tracker:
         index = frame.number - history[0].number
         neighbour = history[index - 1 if index else 1]
         motions = (places(tracks, frame) - places(tracks, neighbour)) * (1 if index else -1)
-        slow = np.hypot(motions[:, 0], motions[:, 1]) < _SLOW_PX
+        slow = np.hypot(motions[:, 0], motions[:, 1]) < SLOW_PX
         long = np.array([track.length for track in tracks]) > _LONGEST_POINT_PX
         rows = np.flatnonzero(~(slow & long))
         hidden = _hidden(tracks, frame, history, _WINGS_PX)[:, rows]
@@ -307,19 +279,23 @@ class Tracker:
         frames = {frame.number: frame for frame in history}
         sightings = {sighting.frame.number: sighting for sighting in self._sightings}
         links = find_links(self._sightings, log_limit + _CANDIDATE_LOG, max_speed_px)
+        paths = [{n: sightings[n].spots[row] for n, row in link.rows.items()} for link in links]
         finds = [
-            (drift.log_false, {n: _as_spots(frames[n], [row]) for n, row in drift.rows.items()})
+            (drift.log_false, {n: as_spots(frames[n], [row]) for n, row in drift.rows.items()})
             for drift in drifts
         ]
         finds += [
-            (link.log_false, {n: sightings[n].spots[[row]] for n, row in link.rows.items()})
-            for link in links
+            (link.log_false, {n: np.array([spot], SPOT_DTYPE) for n, spot in path.items()})
+            for link, path, moves in zip(links, paths, moves_on(paths, frames), strict=True)
+            if moves
         ]
         born: list[Track] = []
         candidates: list[Track] = []
         for log_false, spots in finds:
             hits = {number: Hit.of_all(frames[number], spot)[0] for number, spot in spots.items()}
             if _is_still(hits):
+                if is_sharper_than_stars({n: spot[0] for n, spot in spots.items()}, frames):
+                    continue
                 # Where many defects are known, more are not.
                 log_false += np.log(1 + _UNKNOWN_DEFECTS * defects)
             track = Track(log_false, _frame_seconds(history), hits)
@@ -335,12 +311,24 @@ class Tracker:
                 candidates.append(track)
                 continue
             self._look_back(track, history, [*self._tracks, *born])
-            self._last_id += 1
-            track.track_id = self._last_id
+            self._name(track)
             born.append(track)
-            for number, hit in track.hits.items():
-                _take(sightings[number], [hit])
+            for number in track.hits.keys() & sightings.keys():
+                _take(sightings[number], [track.hits[number]])
         return born, candidates
+
+    def _name(self, track: Track) -> None:
+        """Give a new track its id: that of the track that had ended where it begins, if one has.
+
+        What was lost behind a star is found again.
+        """
+        for ended in self._ended:
+            if _same(track, ended):
+                self._ended.remove(ended)
+                track.go_on_from(ended)
+                return
+        self._last_id += 1
+        track.track_id = self._last_id
 
     def _look_back(self, track: Track, history: History, others: list[Track]) -> None:
         """Find a new track in the frames in which it was below the threshold."""
@@ -371,57 +359,6 @@ def _frame_seconds(history: History) -> float:
 def _is_still(hits: dict[int, Hit]) -> bool:
     """Whether hits keep to one place in the sensor."""
     return bool(np.hypot(*np.ptp([hit.xy for hit in hits.values()], axis=0)) < _STILL_PX)
-
-
-def _as_spots(frame: PastFrame, rows: Sequence[int] | NDArray[np.intp]) -> NDArray[np.void]:
-    """Objects of a frame as if they were spots."""
-    objects = frame.objects[rows]
-    spots = np.zeros(len(objects), SPOT_DTYPE)
-    for name in ("x", "y", "sigma_x", "sigma_y", "snr", "flux", "length", "angle"):
-        spots[name] = objects[name]
-    spots["excess"], spots["object_index"] = objects["snr"], rows
-    return spots
-
-
-def _candidates(
-    tracks: Sequence[Track], frame: PastFrame, sighting: Sighting
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.void], Array]:
-    """What tracks may take: the row of the track, and a number, the spot and its distance.
-
-    Distances are squared and statistical, from where the track is expected.  A fast track takes
-    spots, since it would take stars among the objects; a slow one takes objects of its brightness
-    and shape, since a spot is only that side of it which has moved.
-    """
-    states, spread = predict(tracks, frame.stamp_ns)
-    expected = states[:, :2]
-    step = np.array([track.speed * track.frame_s for track in tracks])
-    centre, reach, slow = as_complex(expected), _FARTHEST_PX + step / 2, step <= _SLOW_PX
-    index = sighting.spots["object_index"]
-    near = [(i, k, d < reach[i]) for i, k, d in sighting.near(centre, reach)]
-    row, number, good = (np.concatenate(part) for part in zip(*near, strict=True))
-    good &= ~slow[row] | (index[number] >= 0)
-    row, number = row[good], number[good]
-    rest = np.ones(len(frame.objects), bool)
-    rest[index[index >= 0]] = False
-    rest = np.flatnonzero(rest)
-    objects = as_complex(frame.object_sky[rest])
-    slow_row = np.flatnonzero(slow)
-    which, column = np.nonzero(np.abs(objects - centre[slow_row, None]) < reach[slow_row, None])
-    spots = np.concatenate([sighting.spots[number], _as_spots(frame, rest[column])])
-    row = np.concatenate([row, slow_row[which]])
-    number = np.concatenate([number, len(sighting.spots) + rest[column]])
-
-    off = frame.sky(np.stack([spots["x"], spots["y"]], axis=1)) - expected[row]
-    spread = spread[row, :2, :2] + covariances(frame, spots) + _SPREAD_PX**2 * np.eye(2)
-    distance = np.sum(off * np.linalg.solve(spread, off[:, :, None])[:, :, 0], axis=1)
-    flux, length = (
-        np.array([getattr(track, name) for track in tracks])[row] for name in ("flux", "length")
-    )
-    ratio = np.log(np.maximum(spots["flux"], 1e-9) / np.maximum(flux, 1e-9)) / np.log(_FLUX_RATIO)
-    longer = np.maximum(spots["length"] - length, 0) / _LONGER_PX
-    distance += ratio**2 + longer**2
-    distance[slow[row] & (np.abs(ratio) > 1)] = _NEVER
-    return row, number, spots, distance
 
 
 def _take(sighting: Sighting, hits: list[Hit]) -> None:

@@ -1,0 +1,205 @@
+"""Two frames of a sequence compared: the flow between them, and the motion of the star field.
+
+Stands between the objects of a frame and what the pipeline keeps of many: it leads the optical
+flow to where the field went and asks whether what it found is the field's motion, or chance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ofsat_ros.optical_flow import Flow, FlowInput, flow_engine
+from ofsat_ros.parameters import Parameters
+from ofsat_ros.star_field import StarFieldMotion, estimate_motion, vote_shift
+
+Array = NDArray[np.float64]
+
+# Images that were preprocessed differently cannot be compared.
+_PREPROCESSING = [p.name for p in Parameters.describe() if p.stage == "preprocessing"]
+# What of an object noise and clouds hardly show.
+_CLEAR_SNR = 7.0
+# So many clear objects are a star field that another frame of it would show, too.
+_FEW_STARS = 3
+# A place on an object is its place if it is as near as this to its centroid, px and in lengths.
+_ON_PX, _ON_SHARE = 3.0, 0.25
+# A track is as near as this to where it is expected if the field goes on as it did, px.
+_NEAR_PX = 10.0
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A frame that others are compared with.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Its stamp, ns UTC.
+    dtype : numpy.dtype
+        Of its image.
+    parameters : Parameters
+        Those that it was processed with.
+    objects : (N,) OBJECT_DTYPE
+        Its objects.
+    flow_input : FlowInput
+        The same for the flow engines.
+    """
+
+    stamp_ns: int
+    dtype: np.dtype
+    parameters: Parameters
+    objects: NDArray[np.void]
+    flow_input: FlowInput
+
+    @property
+    def all(self) -> NDArray[np.bool_]:
+        """All objects, (N,)."""
+        return np.ones(len(self.objects), bool)
+
+    @property
+    def clear(self) -> NDArray[np.bool_]:
+        """Which objects are clear ones, (N,)."""
+        return self.objects["snr"] >= _CLEAR_SNR
+
+
+def why_not_comparable(before: Seen, now: Seen) -> str:
+    """Say why two frames cannot be compared; empty if they can."""
+    old, new = before.flow_input.smoothed.shape, now.flow_input.smoothed.shape
+    if old != new:
+        return f"the image's size changed from {old[1]}x{old[0]} to {new[1]}x{new[0]}"
+    if before.dtype != now.dtype:
+        return f"the image's type changed from {before.dtype} to {now.dtype}"
+    dt_s, most_s = (now.stamp_ns - before.stamp_ns) / 1e9, now.parameters.max_gap_s
+    if dt_s > most_s:
+        return f"a gap of {dt_s:g} s is longer than max_gap_s = {most_s:g} s"
+    changed = [
+        name
+        for name in _PREPROCESSING
+        if getattr(before.parameters, name) != getattr(now.parameters, name)
+    ]
+    return f"{' and '.join(changed)} changed" if changed else ""
+
+
+def measure_flow(
+    before: Seen, now: Seen, expected: StarFieldMotion | None, parameters: Parameters
+) -> Flow:
+    """Measure the flow of a frame's objects, from where the star field most likely was.
+
+    Parameters
+    ----------
+    before, now : Seen
+        Two frames of the same size.
+    expected : StarFieldMotion or None
+        Motion of the field between them if it goes on as it did.
+    parameters : Parameters
+    """
+    guesses = np.zeros((1, 2))
+    if parameters.first_guess == "field":
+        shift = vote_shift(
+            before.flow_input.xy, before.objects["flux"], now.flow_input.xy, now.objects["flux"]
+        )
+        if shift is None and expected is not None:
+            # Too few votes to tell from chance: a mount most likely goes on as it did.
+            shift = expected.displacement
+        if shift is not None:
+            # No motion comes second: in rate tracking the RSOs stand still.
+            guesses = np.stack([shift, np.zeros(2)])
+    return flow_engine(parameters).measure(before.flow_input, now.flow_input, guesses)
+
+
+def find_motion(
+    flow: Flow,
+    before: Seen,
+    now: Seen,
+    expected: StarFieldMotion | None,
+    parameters: Parameters,
+) -> StarFieldMotion | None:
+    """Find the field's motion in the flow; None if there is none, or it may well be chance.
+
+    See `measure_flow` for the parameters; `inliers` of the result are rows of the flow.
+    """
+    valid = flow.valid
+    motion = estimate_motion(
+        flow.position[valid],
+        flow.displacement[valid],
+        flow.sigma[valid],
+        flow.speed_mean[valid],
+        now.flow_input.smoothed.shape,
+        parameters.star_field_model,
+        parameters.outlier_sigmas,
+    )
+    if motion is None:
+        return None
+    # As published, the mean is never doubted.
+    doubted = parameters.star_field_model != "mean"
+    if doubted and not _is_shared(motion, before, now, expected):
+        return None
+    inliers = np.zeros(len(flow), bool)
+    inliers[valid] = motion.inliers
+    return motion.with_inliers(inliers)
+
+
+def why_another_field(before: Seen, now: Seen, known: Array) -> str:
+    """Say why a frame with no motion from the one before shows another star field.
+
+    Empty if it shows too few stars to be one: they are behind clouds, or there are none.
+
+    Parameters
+    ----------
+    before, now : Seen
+        The frames.
+    known : (K, 2) float64
+        Where tracks are expected, which are no stars, px.
+    """
+    far = ~is_near(now.flow_input.xy, known, now.objects["length"])
+    if np.count_nonzero(now.clear & far) < _FEW_STARS:
+        return ""
+    if np.count_nonzero(before.clear) < _FEW_STARS:
+        return "the frame before showed no star field"
+    return (
+        f"the star field jumped: no motion leads from the {len(before.objects)} objects of the"
+        f" frame before to the {len(now.objects)} of this one"
+    )
+
+
+def is_near(xy: Array, points: Array, beyond_px: Array | float = 0.0) -> NDArray[np.bool_]:
+    """Which places (N, 2) px are near one of the points (K, 2), or beyond that by so much, px."""
+    near = np.zeros(len(xy), bool)
+    for point in points:
+        near |= np.hypot(*(xy - point).T) <= _NEAR_PX + beyond_px
+    return near
+
+
+def _is_shared(
+    motion: StarFieldMotion, before: Seen, now: Seen, expected: StarFieldMotion | None
+) -> bool:
+    """Whether a motion carries objects of one frame onto those of the other, and not by chance.
+
+    The clear ones count by themselves, too: where stars are few, noise outnumbers them.
+    """
+    for one, other in ((before.all, now.all), (before.clear, now.clear)):
+        objects = int(np.count_nonzero(one)), int(np.count_nonzero(other))
+        # Clouds may hide from either frame what the other shows.
+        ways = (now, other, before, motion, -1), (before, one, now, motion, 1)
+        if any(motion.is_credible(expected, objects, *_carried(*way)) for way in ways):
+            return True
+    return False
+
+
+def _carried(
+    start: Seen, rows: NDArray[np.bool_], end: Seen, motion: StarFieldMotion, times: int
+) -> tuple[int, int, float]:
+    """How many objects a motion carries into another frame, onto objects, and their part of it."""
+    there = end.flow_input
+    xy = start.flow_input.xy[rows]
+    place = xy + times * motion.displacement_at(xy)
+    place = place[there.contains(place)]
+    carried = len(place)
+    row = there.object_at(place)
+    place, row = place[row >= 0], row[row >= 0]
+    # Long streaks lie on each other wherever along themselves they are.
+    off = np.hypot(*(place - there.xy[row]).T)
+    found = int(np.count_nonzero(off <= _ON_PX + _ON_SHARE * there.length[row]))
+    return carried, found, there.regions.pixels.size / there.smoothed.size
