@@ -10,14 +10,25 @@ byte order without padding is a view of the given data, read-only if the data is
 
 from __future__ import annotations
 
+import re
+import zlib
 from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
 
+from ofsat_ros.parameters import DetectorParameters
+
+_MAX_PIXELS = DetectorParameters.max_pixels
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
+# A marker begins with 0xff, before which any number of them may fill up (ITU-T T.81, B.1.1.2).
+_JPEG_MARKER = re.compile(b"\xff+(.)", re.DOTALL)
+# Drivers write some tens of them before the frame header; one of a colour profile has up to 255.
+_MOST_JPEG_SEGMENTS = 10_000
+# Of a text that came with an image, so much is quoted.
+_LONGEST_QUOTE = 40
 # Deflate shrinks at most 1032 times and a PNG pixel has at least one bit; JPEG shrinks less.
 _MAX_PIXELS_PER_BYTE = 1032 * 8
 
@@ -59,13 +70,15 @@ _ENCODINGS = {
 }
 
 
-def decode_message(message: Any) -> np.ndarray:
+def decode_message(message: Any, max_pixels: int = _MAX_PIXELS) -> np.ndarray:
     """Return the luminance of an image message, of rclpy or of rosbags.
 
     Parameters
     ----------
     message : sensor_msgs Image or CompressedImage
         Whichever library made it.
+    max_pixels : int
+        An image of more is refused.
 
     Returns
     -------
@@ -78,7 +91,8 @@ def decode_message(message: Any) -> np.ndarray:
         If the image cannot be decoded.
     """
     if hasattr(message, "format"):  # CompressedImage
-        return decode_compressed(message.data, message.format)
+        return decode_compressed(message.data, message.format, max_pixels)
+    check_size(message.width, message.height, max_pixels)
     return decode_image(
         message.data,
         message.encoding,
@@ -124,7 +138,9 @@ def decode_image(
     """
     known = _ENCODINGS.get(encoding)
     if known is None:
-        raise EncodingError(f"unknown encoding {encoding!r}; known are {', '.join(_ENCODINGS)}")
+        raise EncodingError(
+            f"unknown encoding {_quoted(encoding)}; known are {', '.join(_ENCODINGS)}"
+        )
     rows = _rows(_as_bytes(data), known, encoding, width, height, step, bool(is_bigendian))
     native = np.dtype(known.dtype)
     if known.to_gray is None:
@@ -136,7 +152,11 @@ def decode_image(
     return _to_gray(np.ascontiguousarray(rows, native), known.to_gray)
 
 
-def decode_compressed(data: Any, format: str = "") -> np.ndarray:  # noqa: A002 (ROS names it)
+def decode_compressed(
+    data: Any,
+    format: str = "",  # noqa: A002 (ROS names it)
+    max_pixels: int = _MAX_PIXELS,
+) -> np.ndarray:
     """Return the pixels of a ``sensor_msgs/CompressedImage`` (PNG or JPEG) as luminance.
 
     Parameters
@@ -144,7 +164,11 @@ def decode_compressed(data: Any, format: str = "") -> np.ndarray:  # noqa: A002 
     data : bytes, bytearray, memoryview, array.array or ndarray of uint8
         The compressed image.
     format : str
-        The message's field; drivers fill it in many ways, so it is only quoted in errors.
+        The message's field.  Drivers fill it in many ways, so it is quoted in errors, and else
+        counts for one thing only: ``bayer_rggb8; png compressed`` and its like tell that a PNG
+        of one channel holds a Bayer pattern.
+    max_pixels : int
+        An image of more, as its header tells before anything is decoded, is refused.
 
     Returns
     -------
@@ -153,7 +177,7 @@ def decode_compressed(data: Any, format: str = "") -> np.ndarray:  # noqa: A002 
     Raises
     ------
     EncodingError
-        If the data is neither PNG nor JPEG, or is cut short or damaged.
+        If the data is neither PNG nor JPEG, is cut short or damaged, or holds too many pixels.
     """
     raw = _as_bytes(data)
     width, height = _compressed_size(raw, format)
@@ -162,15 +186,24 @@ def decode_compressed(data: Any, format: str = "") -> np.ndarray:  # noqa: A002 
             f"compressed image of {raw.size} bytes cannot hold the {width} x {height} px that its"
             " header tells of"
         )
+    check_size(width, height, max_pixels)
+    is_png = raw[0] == _PNG[0]
+    if is_png:
+        _check_png(raw)
     try:
         image = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
-        raise EncodingError(f"compressed image cannot be decoded: {error}") from error
-    if image is None or image.dtype not in (np.uint8, np.uint16):
+        said = " ".join(str(error).split())
+        raise EncodingError(f"compressed image cannot be decoded: {said}") from error
+    whole = image is not None and image.shape[:2] == (height, width)
+    if not whole or image.dtype not in (np.uint8, np.uint16):
         raise EncodingError(
-            f"compressed image ({raw.size} bytes, {width} x {height} px, format {format!r}) is"
-            " damaged or cut short"
+            f"compressed image ({raw.size} bytes, {width} x {height} px, format {_quoted(format)})"
+            " is damaged or cut short"
         )
+    pattern = _ENCODINGS.get(format.partition(";")[0].strip())
+    if is_png and image.ndim == 2 and pattern and pattern.channels == 1 and pattern.to_gray:
+        return _demosaic(image, pattern.to_gray)
     return luminance(image)
 
 
@@ -276,6 +309,18 @@ def _demosaic(mosaic: np.ndarray, code: int) -> np.ndarray:
     return _to_gray(mosaic, code)
 
 
+def check_size(width: int, height: int, max_pixels: int = _MAX_PIXELS) -> None:
+    """Raise EncodingError if an image has more pixels than `max_pixels`."""
+    if width * height > max_pixels:
+        raise EncodingError(
+            f"too many pixels: {width} x {height}, where max_pixels allows {max_pixels}"
+        )
+
+
+def _quoted(text: str) -> str:
+    return repr(text if len(text) <= _LONGEST_QUOTE else f"{text[:_LONGEST_QUOTE]}...")
+
+
 def _compressed_size(raw: np.ndarray, format_field: str) -> tuple[int, int]:
     """Return width and height as the header of a PNG or JPEG tells them."""
     head = raw[:24].tobytes()
@@ -285,8 +330,30 @@ def _compressed_size(raw: np.ndarray, format_field: str) -> tuple[int, int]:
         return _jpeg_size(raw.tobytes())
     raise EncodingError(
         f"compressed image is neither PNG nor JPEG: its {raw.size} bytes begin with"
-        f" {head[:8].hex(' ')} (format {format_field!r})"
+        f" {head[:8].hex(' ')} (format {_quoted(format_field)})"
     )
+
+
+def _check_png(raw: np.ndarray) -> None:
+    """Raise unless every chunk of a PNG is there and has its checksum (ISO/IEC 15948, 5.3).
+
+    OpenCV would decode what a damaged one holds as far as it goes, or take memory for a size that
+    is not true, and say so past the log.
+    """
+    png, at, kind = raw.data, len(_PNG), b""
+    while kind != b"IEND":
+        length, kind = int.from_bytes(png[at : at + 4], "big"), bytes(png[at + 4 : at + 8])
+        end = at + 12 + length
+        if end > len(png):
+            raise EncodingError(
+                f"PNG image of {len(png)} bytes is cut short: its chunk at byte {at} ends at {end}"
+            )
+        if zlib.crc32(png[at + 4 : end - 4]) != int.from_bytes(png[end - 4 : end], "big"):
+            raise EncodingError(
+                f"PNG image of {len(png)} bytes is damaged: its chunk at byte {at} does not have"
+                " its checksum"
+            )
+        at = end
 
 
 def _jpeg_size(jpeg: bytes) -> tuple[int, int]:
@@ -295,11 +362,13 @@ def _jpeg_size(jpeg: bytes) -> tuple[int, int]:
     if b"\xff\xd9" not in jpeg:
         raise EncodingError(f"JPEG image of {len(jpeg)} bytes is cut short: it has no end marker")
     at = 2
-    while at + 9 <= len(jpeg) and jpeg[at] == 0xFF:
-        marker = jpeg[at + 1]
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            height, width = (int.from_bytes(jpeg[i : i + 2], "big") for i in (at + 5, at + 7))
+    for _ in range(_MOST_JPEG_SEGMENTS):
+        marker = _JPEG_MARKER.match(jpeg, at)
+        if marker is None or marker.end() + 7 > len(jpeg):
+            break
+        at, kind = marker.end(), marker[1][0]
+        if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):
+            height, width = (int.from_bytes(jpeg[i : i + 2], "big") for i in (at + 3, at + 5))
             return width, height
-        fill = marker == 0xFF
-        at += 1 if fill else 2 + int.from_bytes(jpeg[at + 2 : at + 4], "big")
+        at += int.from_bytes(jpeg[at : at + 2], "big")
     raise EncodingError(f"JPEG image of {len(jpeg)} bytes is damaged: it has no frame header")

@@ -330,3 +330,52 @@ def test_damaged_bytes_give_an_image_or_an_encoding_error(suffix, at, patch):
 def test_png_refuses_what_it_cannot_hold(image):
     with pytest.raises(EncodingError, match=f"not {image.dtype} of shape"):
         encode_png(image)
+
+
+def test_png_with_a_flipped_bit_anywhere_is_refused_before_it_is_decoded(capfd):
+    png = encode_png(known_pixels("u2", (20, 30)))
+    for at in range(8, len(png)):
+        broken = bytearray(png)
+        broken[at] ^= 16
+        with pytest.raises(EncodingError):
+            decode_compressed(bytes(broken))
+    assert not capfd.readouterr().err
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("name", BAYER)
+def test_png_of_a_bayer_pattern_is_interpolated_as_the_raw_image_is(name, bits):
+    mosaic = known_pixels(f"u{bits // 8}", (12, 16))
+    encoding = f"bayer_{name}{bits}"
+    raw = decode_image(mosaic.tobytes(), encoding, 16, 12, mosaic.strides[0], False)
+    compressed = decode_compressed(encode_png(mosaic), f"{encoding}; png compressed ")
+    np.testing.assert_array_equal(compressed, raw)
+
+
+def test_format_that_tells_of_a_bayer_pattern_does_not_touch_colour_or_jpeg():
+    colour = known_pixels("u1", (12, 16, 3))
+    png, jpeg = (cv2.imencode(kind, colour)[1].tobytes() for kind in (".png", ".jpg"))
+    for data in (png, jpeg):
+        named = decode_compressed(data, "bayer_rggb8; jpeg compressed bgr8")
+        np.testing.assert_array_equal(named, decode_compressed(data))
+
+
+def test_more_than_max_pixels_is_refused_before_it_is_decoded(monkeypatch):
+    png = encode_png(np.zeros((30, 40), np.uint8))
+    assert decode_compressed(png, max_pixels=1200).shape == (30, 40)
+    monkeypatch.setattr(cv2, "imdecode", None)
+    for data in (png, cv2.imencode(".jpg", np.zeros((30, 40), np.uint8))[1].tobytes()):
+        with pytest.raises(EncodingError, match=r"too many pixels: 40 x 30, .* allows 1199"):
+            decode_compressed(data, max_pixels=1199)
+
+
+@pytest.mark.parametrize("filling", [b"\xff", b"\xff\xe0\x00\x02", b"\xff\xe0\x00\x00"])
+def test_jpeg_of_nothing_but_markers_is_refused_at_once(filling):
+    # Megabytes of them, read one by one, would hold the node up for seconds.
+    with pytest.raises(EncodingError, match="no frame header"):
+        decode_compressed(b"\xff\xd8\xff\xe0\x00\x02" + filling * 1_000_000 + b"\xff\xd9")
+
+
+def test_what_comes_with_an_image_is_quoted_in_part():
+    with pytest.raises(EncodingError, match=r"^unknown encoding '(x{40})\.\.\.'; known are mono8"):
+        decode_image(b"1234", "x" * 100_000, 2, 2, 2, False)

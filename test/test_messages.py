@@ -4,7 +4,6 @@ import sys
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CompressedImage, Image, PointCloud2, PointField
 from std_msgs.msg import Header
@@ -405,11 +404,3 @@ def test_star_field_motion_is_unknown_without_a_field():
     for nothing in (None, result(detections(0))):
         vector = messages.star_field_vector(HEADER, nothing).vector
         assert np.isnan([vector.x, vector.y, vector.z]).all()
-
-
-def test_diagnostic_is_a_warning_only_with_problems():
-    good = messages.diagnostic("name", [], "2 RSOs", {"rate_hz": 1.23456789, "stars": 12})
-    assert (good.level, good.message) == (DiagnosticStatus.OK, "2 RSOs")
-    assert [(v.key, v.value) for v in good.values] == [("rate_hz", "1.235"), ("stars", "12")]
-    bad = messages.diagnostic("name", ["no image", "slow"], "2 RSOs", {})
-    assert (bad.level, bad.message) == (DiagnosticStatus.WARN, "no image; slow")

@@ -37,7 +37,7 @@ STAGES = {
     *("detection", "tracking", "pipeline"),
 }
 UNITS = {
-    **{"_px": "px", "_deg_s": "deg/s", "_deg_s2": "deg/s^2"},
+    **{"_px": "px", "_pixels": "px", "_deg_s": "deg/s", "_deg_s2": "deg/s^2"},
     **{"_hz": "Hz", "_mag": "mag", "_s": "s"},
 }
 # Numbers that count or scale, and so have no unit.

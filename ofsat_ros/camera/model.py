@@ -60,6 +60,7 @@ class Camera:
     _lens: Lens = field(init=False, repr=False)
     _inverse: Array = field(init=False, repr=False)
 
+    @np.errstate(all="ignore")  # what overflows is no number, and refused as such
     def __post_init__(self) -> None:
         matrix = np.array(self.matrix, float)
         distortion = np.array(self.distortion, float).ravel()
@@ -73,6 +74,8 @@ class Camera:
         sides = [(-0.5, length - 0.5) for length in (self.width, self.height)]
         corners = np.array([(x, y) for x in sides[0] for y in sides[1]]) - matrix[:2, 2]
         extent = np.hypot(*(inverse @ corners.T)).max()
+        if not np.isfinite(extent):
+            raise CameraError("the calibration's values are absurd: no pixel has a direction")
         for name, value in (
             ("matrix", matrix),
             ("distortion", distortion),
@@ -83,6 +86,7 @@ class Camera:
             object.__setattr__(self, name, value)
 
     @classmethod
+    @np.errstate(all="ignore")
     def from_calibration(
         cls,
         width: int,

@@ -50,6 +50,15 @@ class DetectorParameters(Table):
         "live camera: frames may wait so long, and then all but the newest are dropped",
         live=False,
     )
+    max_pixels: int = number(
+        200_000_000,
+        256,
+        2**30,
+        "px",
+        "detector",
+        "an image of more is refused before memory is taken for it, also a compressed one whose"
+        " header tells of them",
+    )
     marker_scale: float = number(
         5.0, 0.1, 1000.0, "", "detector", "length of a drawn flow vector, in frames of motion"
     )
@@ -195,7 +204,8 @@ class GuideParameters(Table):
         3600.0,
         "s",
         "guide",
-        "time in which a standing offset is learned, at least four times settling_s; 0: never",
+        "time in which a standing offset is learned, at least four times settling_s, since it"
+        " swings otherwise; 0: never",
     )
     mount_latency_s: float = number(
         0.0,
@@ -240,6 +250,15 @@ class GuideParameters(Table):
     command_hz: float = number(
         20.0, 0.1, 1000.0, "Hz", "guide", "how often the mount is commanded", live=False
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        least_s = 4 * self.settling_s
+        if 0 < self.integral_s < least_s * (1 - 1e-9):
+            raise ParameterError(
+                f"integral_s = {self.integral_s:g} s must be at least four times settling_s ="
+                f" {self.settling_s:g} s, so at least {least_s:g} s, or 0"
+            )
 
 
 @dataclass(frozen=True)
