@@ -627,7 +627,7 @@ def test_one_stamp_in_the_future_harms_no_later_attitude():
 
 def test_a_full_memory_takes_what_comes_after_time_has_run_backwards():
     attitudes = Attitudes(keep=3)
-    for each in (10, 11, 12, 13, 0, 1):
+    for each in (10, 11, 12, 13, 0, 1, 2):
         attitudes.add(each * NS, turning(each))
     attitude, _ = attitudes.at(round(1.5 * NS), 1.0)
     assert angle_between(attitude, turning(1.5)) < 1e-9

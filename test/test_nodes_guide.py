@@ -231,7 +231,7 @@ def test_without_calibration_it_waits(bench, info, why):
     bench.info = info
     bench.engage(True)
     said = bench.until_state("waiting for camera_info")
-    assert said["level"] == DiagnosticStatus.WARN
+    assert said["level"] == DiagnosticStatus.ERROR
     assert why in said["message"]
     bench.info = camera_info()
     bench.until_state("following")

@@ -1,5 +1,6 @@
 """The player over real DDS: what the bag holds arrives whole, in order, when it should."""
 
+import re
 import threading
 import time
 from types import SimpleNamespace
@@ -78,7 +79,7 @@ def test_rate_start_and_clock(bag, stop):
     assert len(times) > 2 * len(heard)  # it runs on between the frames
 
 
-def test_rate_may_change_while_playing(bag, stop):
+def test_rate_may_change_while_playing(bag, stop, capfd):
     with Graph("-p", "rate:=0.01") as graph:
         heard = graph.listen(Image, "/camera/image")
         graph.add(Player(stop, f"{bag}", context=graph.context))
@@ -89,6 +90,9 @@ def test_rate_may_change_while_playing(bag, stop):
         assert graph.call(SetParametersAtomically, service, request).result.successful
         graph.until(stop.is_set)
         graph.until(lambda: len(heard) == len(FRAMES))
+    # Who waits is told for how long, and what to do.
+    pause = r"the recording pauses: its next message is due in \d\d s; .* rate 100"
+    assert re.search(pause, capfd.readouterr().err)
 
 
 def test_loop_goes_on_until_told_otherwise(bag, stop):

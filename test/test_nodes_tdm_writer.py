@@ -61,21 +61,23 @@ class Writer:
         self.node = graph.add(TdmWriter(threading.Event(), context=graph.context))
         self._clouds = graph.publisher(PointCloud2, "rso_detections")
         graph.connect(self._clouds)
-        self._sent = self._taken = 0
-        take = self.node._arcs.add
-
-        def counted(*frame: object) -> None:
-            take(*frame)
-            self._taken += 1
-
-        self.node._arcs.add = counted
+        self._sent = 0
 
     def hear(self, *frames: PointCloud2) -> None:
+        """Send frames, and wait until they are taken, and what has ended is written."""
         for frame in frames:
             self._clouds.publish(frame)
             self.graph.serve_once()
         self._sent += len(frames)
-        self.graph.until(lambda: self._taken == self._sent)
+        self.graph.until(lambda: self.node._counts["frames"] == self._sent)
+        self.wait_until_written()
+
+    def wait_until_written(self) -> None:
+        self.graph.until(lambda: not self.node._waiting or self.node._why_waiting)
+
+    def time_passes(self) -> None:
+        self.node._on_timer()
+        self.wait_until_written()
 
 
 @pytest.fixture
@@ -147,7 +149,7 @@ def test_names_may_be_given_while_the_track_lasts(writer, tmp_path):
 def test_a_bag_that_begins_anew_gives_files_of_its_own(writer, tmp_path):
     # The detector never gives a number twice, but one that was started anew does.
     writer.hear(*(cloud(k, 1) for k in range(5)))
-    writer.hear(cloud(0))
+    writer.hear(cloud(-1), cloud(0))
     assert tracks_of(tmp_path / "out") == ["20260921T141320_1.tdm"]
     writer.hear(*(cloud(k, 1, 2) for k in range(1, 5)))
     writer.node.close()
@@ -210,18 +212,18 @@ class Steady:
 def test_tracks_end_when_no_more_images_come(writer, tmp_path, monkeypatch, interval_s, silent_s):
     clock = Steady()
     monkeypatch.setattr("ofsat_ros.nodes.tdm_writer.time", clock)
-    writer.node._on_timer()  # nothing was heard yet
+    writer.time_passes()  # nothing was heard yet
     for k in range(5):
         writer.hear(cloud(k, 1, 2))
         clock.now_s += interval_s
     clock.now_s += silent_s - interval_s - 0.01
-    writer.node._on_timer()
+    writer.time_passes()
     assert tracks_of(tmp_path / "out") == []
     clock.now_s += 0.02
-    writer.node._on_timer()
+    writer.time_passes()
     names = ["20260921T141320_1.tdm", "20260921T141320_2.tdm"]
     assert tracks_of(tmp_path / "out") == names
-    writer.node._on_timer()
+    writer.time_passes()
     writer.hear(*(cloud(k, 1) for k in range(6, 9)))
     writer.node.close()
     assert tracks_of(tmp_path / "out") == [*names, "20260921T141326_1-2.tdm"]
@@ -269,7 +271,7 @@ def test_what_cannot_be_written_is_kept_and_tried_again(writer, tmp_path, monkey
 
     monkeypatch.setattr("os.fsync", full)
     heard = writer.graph.listen(DiagnosticArray, "/diagnostics")
-    writer.hear(*(cloud(k, 1, 2) for k in range(5)), cloud(20, 3), cloud(21, 3), cloud(22, 3))
+    writer.hear(*(cloud(k, 1, 2) for k in range(5)), *(cloud(k, 3) for k in range(20, 24)))
     assert tracks_of(tmp_path / "out") == []
     problem = "2 tracks waiting: .*_1.tdm cannot be written: No space left on device"
     writer.graph.until(lambda: heard and re.search(problem, heard[-1].status[0].message))
@@ -277,6 +279,7 @@ def test_what_cannot_be_written_is_kept_and_tried_again(writer, tmp_path, monkey
     assert capfd.readouterr().err.count("No space left") == 1
     monkeypatch.setattr("os.fsync", real)
     writer.node._on_timer()
+    writer.graph.until(lambda: not writer.node._waiting)
     assert len(tracks_of(tmp_path / "out")) == 3
     writer.node.close()
     assert writer.node.exit_code == 0

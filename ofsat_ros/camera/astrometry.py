@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ofsat_ros.camera.model import Camera, CameraError, to_radec
 from ofsat_ros.parameters import CameraParameters
+from ofsat_ros.timeline import AstrayError, Timeline
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _NS = 1_000_000_000
-# Attitudes come out of order by less, ns; by more, time has run backwards.
+# Attitudes come out of order by less, ns; by more, they are astray, or time has run backwards.
 _DISORDER_NS = 1_000_000_000
 # An attitude whose stamp differs by less is that of the frame itself.
 _SAME_NS = 1_000_000
@@ -59,18 +60,24 @@ class Attitudes:
 
     def __init__(self, keep: int = _KEPT) -> None:
         self._keep = keep
+        self._timeline = Timeline()
         self._stamps: list[int] = []
         self._quaternions: list[list[float]] = []
 
     def add(self, stamp_ns: int, attitude: Rotation) -> None:
         """Take an attitude; one of the same stamp replaces the former.
 
-        They may come a little out of order.  One that is over 1 s older than the newest tells
-        that time has run backwards, or that the newest had a wrong stamp: all are forgotten.
+        They may come out of order by up to 1 s.  One whose stamp is astray (`Timeline`) is left
+        out; when time has run backwards, all are forgotten.
         """
-        if self._stamps and stamp_ns < self._stamps[-1] - _DISORDER_NS:
-            self._stamps.clear()
-            self._quaternions.clear()
+        if not self._stamps or not 0 <= self._stamps[-1] - stamp_ns <= _DISORDER_NS:
+            try:
+                jump_s = self._timeline.follow(stamp_ns)
+            except AstrayError:
+                return
+            if jump_s < 0:
+                self._stamps.clear()
+                self._quaternions.clear()
         place = bisect_left(self._stamps, stamp_ns)
         if self._stamps[place : place + 1] != [stamp_ns]:
             self._stamps.insert(place, stamp_ns)

@@ -62,6 +62,7 @@ class Pinhole:
     def sights(self, points: Array, tolerance: float) -> tuple[Array, Array]:
         """See `Lens`."""
         length = np.sqrt(1 + np.square(points).sum(1))[:, None]
+        length[np.isinf(length)] = np.nan  # no direction of length 0
         sight = np.empty((len(points), 3))
         sight[:, :2], sight[:, 2:] = points / length, 1 / length
         # The part of a step on the plane that is across the direction, over the distance.

@@ -18,6 +18,7 @@ from ofsat_ros.guidance.pointing import (
 )
 from ofsat_ros.guidance.target import Sights, Target, choose, found, found_again, same_again
 from ofsat_ros.parameters import GuideParameters
+from ofsat_ros.timeline import AstrayError, Timeline
 
 Array = NDArray[np.float64]
 
@@ -100,7 +101,7 @@ class Guide:
         self._loop = OffsetLoop()
         self._camera: Camera | None = None
         self._sights: Sights | None = None
-        self._stamp_ns: int | None = None
+        self._timeline = Timeline()
         self._target: Target | None = None
         self._lost_why = ""
         self._now_ns: int | None = None
@@ -139,21 +140,21 @@ class Guide:
         Parameters
         ----------
         stamp_ns : int
-            Middle of its exposure, ns UTC.  A frame that is older than the one before ends what
-            was followed; one with the same stamp is left out.
+            Middle of its exposure, ns UTC.  A frame whose stamp is astray (`Timeline`) is left
+            out; time that has run backwards ends what was followed.
         tracks : (N,) TRACK_DTYPE
             What is NaN in position, velocity or line of sight (`sight`) is taken as not there, as
             is what cannot be.
         camera : Camera or None
             None: not calibrated; nothing is followed.
         """
-        if self._stamp_ns is not None:
-            if stamp_ns == self._stamp_ns:
-                return
-            if stamp_ns < self._stamp_ns:
-                back_s = (self._stamp_ns - stamp_ns) / _NS
-                self._forget(f"the frames' time ran backwards by {back_s:.3g} s")
-        self._stamp_ns, self._camera = stamp_ns, camera
+        try:
+            jump_s = self._timeline.follow(stamp_ns)
+        except AstrayError:
+            return
+        if jump_s < 0:
+            self._forget(f"the frames' time ran backwards by {-jump_s:.3g} s")
+        self._camera = camera
         if camera is None:
             self._sights = None
             self._forget("the camera is not calibrated")
@@ -240,13 +241,15 @@ class Guide:
         if target is None:
             self._choose(sights)
             return
-        row = same_again(target, sights, self._own, camera, self._stale_s)
+        lost_s = (sights.stamp_ns - target.seen_ns) / _NS
+        # The longer ago, the wider is what its path may lead to: in an hour, half of the sky.
+        known = lost_s <= max(self._parameters.reacquire_s, self._stale_s)
+        row = same_again(target, sights, self._own, camera, self._stale_s) if known else None
         if row is not None:
             if not target.present:
                 self._loop.start_anew()
             self._target = found_again(target, sights, row, self._own)
             return
-        lost_s = (sights.stamp_ns - target.seen_ns) / _NS
         if lost_s <= target.patience_s(self._parameters):
             self._target = replace(target, present=False)
             return

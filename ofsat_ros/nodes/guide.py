@@ -12,7 +12,6 @@ import sys
 import threading
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistStamped, Vector3Stamped
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
@@ -24,8 +23,16 @@ from std_srvs.srv import SetBool
 from ofsat_ros.camera import Astrometry, Camera, CameraError
 from ofsat_ros.guidance import Command, Guide
 from ofsat_ros.nodes import messages
+from ofsat_ros.nodes.diagnostics import Diagnostics
 from ofsat_ros.nodes.ros_parameters import NodeParameters
-from ofsat_ros.nodes.runtime import hear_camera_info, overridable_qos, parser_of, reliable, run
+from ofsat_ros.nodes.runtime import (
+    hear_camera_info,
+    overridable_qos,
+    parser_of,
+    qos_explained,
+    reliable,
+    run,
+)
 from ofsat_ros.parameters import CameraParameters, GuideParameters, Table
 
 # A frame's tracks that come late are of use only if nothing newer has come.
@@ -97,7 +104,7 @@ class GuideNode(Node):
         self._offset = publisher(Vector3Stamped, "target_offset")
         self._rate = publisher(Vector3Stamped, "target_rate")
         self._mount_rate = publisher(TwistStamped, "mount_rate")
-        self._diagnostics = publisher(DiagnosticArray, "/diagnostics")
+        self._diagnostics = Diagnostics(self, "guidance")
 
     def _subscribe(self) -> None:
         hear_camera_info(self, self._on_camera_info)
@@ -106,6 +113,7 @@ class GuideNode(Node):
             "rso_tracks",
             self._on_tracks,
             reliable(_DEPTH),
+            event_callbacks=qos_explained(self, "rso_tracks"),
             qos_overriding_options=overridable_qos(),
         )
 
@@ -199,43 +207,37 @@ class GuideNode(Node):
 
     def _publish_diagnostics(self) -> None:
         command = self._command
-        status = messages.diagnostic(
-            f"{self.get_fully_qualified_name()}: guidance",
-            self._problems(command),
-            command.reason if command else "no clock",
-            self._values(command),
-        )
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(array)
+        summary = command.reason if command else "no clock"
+        self._diagnostics.say(summary, self._values(command), *self._problems(command))
 
-    def _problems(self, command: Command | None) -> list[str]:
+    def _problems(self, command: Command | None) -> tuple[list[str], list[str]]:
+        """Return what keeps it from guiding at all, and what is merely not as it should be."""
         own = self._settings[GuideParameters]
-        found = []
+        errors, warnings = [], []
         if command is None:
-            found.append("use_sim_time is set, but no /clock has come")
+            errors.append("use_sim_time is set, but no /clock has come")
         elif command.state not in _GOOD_STATES:
-            found.append(command.reason)
+            warnings.append(command.reason)
         if self._uncalibrated:
-            found.append(f"no directions: {self._uncalibrated}")
+            errors.append(f"no directions: {self._uncalibrated}")
         elif self._without_sight:
-            found.append(
+            errors.append(
                 "the detector gives no lines of sight: does it hear the same camera_info, and is"
                 " that one of its images' size?"
             )
         if not self.count_publishers(self._tracks.topic_name):
-            found.append(f"nobody publishes {self._tracks.topic_name}: is the detector running?")
+            errors.append(f"nobody publishes {self._tracks.topic_name}: is the detector running?")
         if abs(self._lag_s) > own.stale_after_s:
             where = "behind" if self._lag_s > 0 else "ahead of"
-            found.append(
+            errors.append(
                 f"frames are stamped {abs(self._lag_s):.1f} s {where} this node's clock: check"
                 " use_sim_time, stamp_offset_s, the machines' clocks, and that the sender keeps up"
             )
-            self.get_logger().warning(found[-1], throttle_duration_sec=_WARN_EVERY_S)
+            self.get_logger().warning(errors[-1], throttle_duration_sec=_WARN_EVERY_S)
         others = self.count_publishers(self._mount_rate.topic_name) - 1
         if others > 0 and command is not None and command.commanding:
-            found.append(f"{others} more publish {self._mount_rate.topic_name}")
-        return found
+            warnings.append(f"{others} more publish {self._mount_rate.topic_name}")
+        return errors, warnings
 
     def _values(self, command: Command | None) -> dict[str, object]:
         if command is None:

@@ -61,6 +61,8 @@ _ANSWER_PATIENCE_S = 30.0
 _BEST_EFFORT_GRACE_S = 0.5
 # Being late by less is caught up with, by more is not.
 _CATCH_UP_S = 1.0
+# A longer wait for the next message is said aloud: a camera that paused, or a clock that was set.
+_LONG_WAIT_S = 10.0
 
 
 class Player(Node):
@@ -223,6 +225,7 @@ class Player(Node):
 
     def _wait_until_due(self, last_ns: int, time_ns: int, due_s: float) -> float:
         """Wait until a message's time has come; return when that was.  Advances the clock."""
+        said = False
         while not self._stop.is_set():
             rate = self._settings[PlayerParameters].rate  # it may change meanwhile
             now_s = time.monotonic()
@@ -231,6 +234,12 @@ class Player(Node):
             next_s = due_s + (time_ns - last_ns) / _NS / rate
             if next_s <= now_s:
                 return max(next_s, now_s - _CATCH_UP_S)
+            if next_s - now_s > _LONG_WAIT_S and not said:
+                said = True
+                self.get_logger().info(
+                    f"the recording pauses: its next message is due in {next_s - now_s:.0f} s; a"
+                    f" higher rate is sooner there: ros2 param set {self.get_name()} rate 100"
+                )
             if now_s - self._clock_at_s >= _CLOCK_PERIOD_S:
                 self._publish_clock(time_ns - round((next_s - now_s) * rate * _NS))
             self._stop.wait(min(next_s - now_s, _CLOCK_PERIOD_S))

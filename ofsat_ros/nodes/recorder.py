@@ -7,6 +7,7 @@ Writes into a folder: ``detections.csv``, ``frame_*.png`` (every n-th annotated 
 from __future__ import annotations
 
 import math
+import shutil
 import sys
 import threading
 import time
@@ -26,8 +27,17 @@ from visualization_msgs.msg import MarkerArray
 
 from ofsat_ros.images import encode_png
 from ofsat_ros.nodes import messages
+from ofsat_ros.nodes.diagnostics import Diagnostics
 from ofsat_ros.nodes.ros_parameters import NodeParameters
-from ofsat_ros.nodes.runtime import StartError, overridable_qos, parser_of, reliable, run
+from ofsat_ros.nodes.runtime import (
+    StartError,
+    overridable_qos,
+    parser_of,
+    qos_explained,
+    reliable,
+    run,
+    say,
+)
 from ofsat_ros.parameters import RecorderParameters
 from ofsat_ros.recordings import BagWriter, RecordingError
 from ofsat_ros.results import DETECTION_COLUMNS, DETECTIONS, detection_lines, in_words
@@ -43,6 +53,8 @@ _PICTURES_DEPTH = 20
 _WARN_EVERY_S = 10.0
 # Consecutive frames without detection that share one line of the table.
 _QUIET_FRAMES = 10
+# Of a disk; a night of results without pictures takes less.
+_LITTLE_ROOM_BYTES = 1e9
 # What else belongs to the last frame comes a moment after its detections.
 _LAST_RESULTS_S = 1.0
 
@@ -87,6 +99,7 @@ class Recorder(Node):
         self._table = _Table()
         self._frames = self._pictures = 0
         self._detections: Counter[int] = Counter()  # of each track, 0 for candidates
+        self._numbers = _Numbers()
         self._recent: deque[tuple[int, int]] = deque(maxlen=_DEPTH)  # stamp, frame
         self._last_frame_s = math.inf
         self._hears = False
@@ -96,6 +109,8 @@ class Recorder(Node):
         self._subscribe()
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(0.1, self._watch, clock=steady)
+        self._diagnostics = Diagnostics(self, "recording")
+        self.create_timer(1.0, self._publish_diagnostics, clock=steady)
         self.get_logger().info(f"recording into {self._folder}")
 
     def close(self) -> None:
@@ -111,22 +126,23 @@ class Recorder(Node):
                     self._give_up(error)
         if self.exit_code:
             return
-        _say(
+        say(
             f"{self._frames} frames, {in_words(self._detections)}; {DETECTIONS},"
             f" {self._pictures} pictures and the bag {BAG} are in {self._folder}"
         )
 
     def _subscribe(self) -> None:
         def subscribe(
-            kind: type, topic: str, take: Callable[[bytes], None], depth: int = _DEPTH
+            kind: type, topic: str, take: Callable[..., None], depth: int = _DEPTH
         ) -> str:
             # Raw: the bag is to hold what was received, and few pictures are looked into.
             subscription = self.create_subscription(
                 kind,
                 topic,
-                lambda data: self._take(topic, take, data),
+                lambda data, info: self._take(topic, take, data, info),
                 reliable(depth),
                 raw=True,
+                event_callbacks=qos_explained(self, topic),
                 qos_overriding_options=overridable_qos(),
             )
             return subscription.topic_name
@@ -138,10 +154,10 @@ class Recorder(Node):
         if self._own.picture_every:
             subscribe(Image, "image_annotated", self._on_picture, _PICTURES_DEPTH)
 
-    def _take(self, topic: str, take: Callable[[bytes], None], data: bytes) -> None:
+    def _take(self, topic: str, take: Callable[..., None], data: bytes, info: dict) -> None:
         try:
             if not self.exit_code:
-                take(data)
+                take(data, info["publication_sequence_number"])
         except (OSError, RecordingError) as error:
             self._give_up(error)
         # Whatever others publish under these names must not end the recording.
@@ -155,15 +171,20 @@ class Recorder(Node):
         """End, since a file cannot be written; say the first reason."""
         if not self.exit_code:
             self.exit_code = 1
-            sys.stderr.write(f"recorder: the recording in {self._folder} ends: {error}\n")
+            say(f"recorder: the recording in {self._folder} ends: {error}", sys.stderr)
         self._stop.set()
 
-    def _on_detections(self, data: bytes) -> None:
+    def _on_detections(self, data: bytes, sequence: int) -> None:
         cloud = deserialize_message(data, PointCloud2)
         stamp, rows = messages.stamp_ns(cloud.header.stamp), messages.detections_array(cloud)
         with self._lock:
             if self._closed or self._is_complete():
                 return
+            if began_after := self._numbers.make_unique(rows["track_id"], sequence):
+                self.get_logger().warning(
+                    f"another detector sends, or the same was started anew: in {DETECTIONS}, its"
+                    f" track 1 is {began_after + 1}, and so on"
+                )
             self._write(self._cloud_topic, "sensor_msgs/msg/PointCloud2", data, stamp)
             self._csv.writelines(detection_lines(stamp, self._frames, rows))
             self._csv.flush()
@@ -173,23 +194,23 @@ class Recorder(Node):
             self._detections.update(rows["track_id"].tolist())
             self._last_frame_s = time.monotonic()
 
-    def _on_tracks(self, data: bytes) -> None:
+    def _on_tracks(self, data: bytes, _: int) -> None:
         with self._lock:
             stamp = messages.header_stamp_ns(data)
             self._write(self._tracks_topic, "sensor_msgs/msg/PointCloud2", data, stamp)
 
-    def _on_motion(self, data: bytes) -> None:
+    def _on_motion(self, data: bytes, _: int) -> None:
         with self._lock:
             stamp = messages.header_stamp_ns(data)
             self._write(self._motion_topic, "geometry_msgs/msg/Vector3Stamped", data, stamp)
 
-    def _on_markers(self, data: bytes) -> None:
+    def _on_markers(self, data: bytes, _: int) -> None:
         with self._lock:
             # The array's length comes first, then the first marker's header.
             stamp = messages.header_stamp_ns(data, messages.FIRST_MARKER_AT)
             self._write(self._marker_topic, "visualization_msgs/msg/MarkerArray", data, stamp)
 
-    def _on_picture(self, data: bytes) -> None:
+    def _on_picture(self, data: bytes, _: int) -> None:
         frame = dict(self._recent).get(messages.header_stamp_ns(data))
         if frame is None or frame % self._own.picture_every:
             return
@@ -213,9 +234,57 @@ class Recorder(Node):
         """Say when a detector is there; end when all is recorded."""
         if not self._hears and self.count_publishers(self._cloud_topic):
             self._hears = True
-            _say(HEARING)
+            say(HEARING)
         if self._is_complete() and time.monotonic() - self._last_frame_s > _LAST_RESULTS_S:
             self._stop.set()
+
+    def _publish_diagnostics(self) -> None:
+        errors, warnings, free = [], [], math.nan
+        if not self.count_publishers(self._cloud_topic):
+            errors.append(f"nobody publishes {self._cloud_topic}: is the detector running?")
+        try:
+            free = float(shutil.disk_usage(self._folder).free)
+        except OSError as error:
+            errors.append(f"{self._folder} cannot be looked into: {error.strerror}")
+        if free < _LITTLE_ROOM_BYTES:
+            warnings.append(f"{self._folder} has room for {free / 1e6:.0f} MB only: free some")
+        with self._lock:
+            values = {
+                "frames_recorded": self._frames,
+                "detections": self._detections.total(),
+                "pictures": self._pictures,
+                "folder": self._folder,
+                "free_bytes": free,
+            }
+        summary = f"{values['frames_recorded']} frames recorded"
+        self._diagnostics.say(summary, values, errors, warnings)
+
+
+class _Numbers:
+    """Keeps the numbers of tracks apart that several detectors give, one after the other or not.
+
+    Each begins with 1.  Who sends is told by the middleware's count of a sender's messages.
+    """
+
+    def __init__(self) -> None:
+        self._highest = 0
+        # Of each sender, the last known one first: count of its messages, and what is added.
+        self._senders: list[list[int]] = []
+
+    def make_unique(self, track_ids: np.ndarray, sequence: int) -> int:
+        """Change numbers in place; return what was added if the sender is a new one, else 0."""
+        near = [sender for sender in self._senders if sender[0] < sequence]
+        sender = max(near, key=lambda one: one[0], default=None)
+        new = sender is None
+        if sender is None:
+            sender = [sequence, self._highest]
+        else:
+            self._senders.remove(sender)
+        sender[0] = sequence
+        self._senders.insert(0, sender)
+        track_ids[track_ids > 0] += sender[1]
+        self._highest = max(self._highest, int(track_ids.max(initial=0)))
+        return sender[1] if new else 0
 
 
 class _Table:
@@ -229,7 +298,7 @@ class _Table:
         """Print the detections of a frame."""
         if not self._begun:
             self._begun = True
-            _say(
+            say(
                 f"{'time (UTC)':>23} {'frame':>6} {'id':>4} {'x px':>8} {'y px':>8}"
                 f" {'px/s':>8} {'towards':>7} {'px/s vs stars':>13} {'SNR':>7}"
             )
@@ -244,7 +313,7 @@ class _Table:
             speed = math.hypot(row["vx"], row["vy"])
             relative = math.hypot(row["rel_vx"], row["rel_vy"])
             towards = math.degrees(math.atan2(row["vy"], row["vx"]))
-            _say(
+            say(
                 f"{when} {frame:6d} {row['track_id'] or '-':>4} {row['x']:8.2f} {row['y']:8.2f}"
                 f" {speed:8.3f} {towards:6.0f}° {relative:13.3f} {row['snr']:7.1f}"
             )
@@ -254,7 +323,7 @@ class _Table:
         if self._quiet:
             first, last = self._quiet[0], self._quiet[-1]
             frames = f"frame {first}" if first == last else f"frames {first} to {last}"
-            _say(f"{'':>23} {frames}: no RSO")
+            say(f"{'':>23} {frames}: no RSO")
             self._quiet.clear()
 
 
@@ -275,11 +344,6 @@ def _claim(folder: Path, overwrite: bool) -> None:
         )
     for path in ours:
         path.unlink(missing_ok=True)
-
-
-def _say(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 def main() -> int:

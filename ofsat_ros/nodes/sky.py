@@ -17,12 +17,12 @@ from std_msgs.msg import Header
 
 from ofsat_ros.camera import Astrometry, Camera, CameraError, rotation_of
 from ofsat_ros.nodes import messages
+from ofsat_ros.nodes.causes import Causes
 from ofsat_ros.nodes.runtime import hear_camera_info, overridable_qos
 from ofsat_ros.parameters import CameraParameters
 
 # Small messages, of which one thread may be late in taking many.
 _DEPTH = 1000
-_WARN_EVERY_S = 10.0
 
 
 class Sky:
@@ -43,7 +43,8 @@ class Sky:
         self._astrometry = Astrometry(parameters)
         self._info: CameraInfo | None = None
         self._uncalibrated = "no camera_info has come"
-        self._has_attitude = False
+        self._has_attitude = self._was_calibrated = False
+        self._bad_calibrations, self._bad_attitudes = Causes(), Causes()
         hear_camera_info(node, self._on_camera_info)
         kind = ReliabilityPolicy.RELIABLE if reliable_input else ReliabilityPolicy.BEST_EFFORT
         node.create_subscription(
@@ -105,7 +106,7 @@ class Sky:
         with self._lock:
             camera = self._astrometry.camera
             if camera is None:
-                return self._uncalibrated, False
+                return self._uncalibrated, self._was_calibrated
             if (camera.height, camera.width) != shape:
                 return (
                     f"camera_info is for images of {camera.width}x{camera.height}, not of"
@@ -124,21 +125,25 @@ class Sky:
             camera = Camera.from_message(info)
         except CameraError as error:
             why = f"camera_info: {error}"
-            if why != self._uncalibrated:
+            if self._bad_calibrations.wrong(str(error)):
                 self._node.get_logger().info(f"{why}; directions are unknown")
+        else:
+            self._bad_calibrations.right()
         with self._lock:
             self._info, self._uncalibrated = info, why
             self._astrometry.camera = camera
+            self._was_calibrated |= camera is not None
 
     def _on_attitude(self, message: QuaternionStamped) -> None:
         q = message.quaternion
         try:
             rotation = rotation_of(q.x, q.y, q.z, q.w)
         except CameraError as error:
-            self._node.get_logger().warning(
-                f"an attitude is left out: {error}", throttle_duration_sec=_WARN_EVERY_S
-            )
+            if self._bad_attitudes.wrong(str(error)):
+                self._node.get_logger().warning(f"an attitude is left out: {error}")
             return
+        if count := self._bad_attitudes.right():
+            self._node.get_logger().info(f"attitudes are good again, after {count} left out")
         with self._lock:
             self._has_attitude = True
             self._astrometry.add_attitude(messages.stamp_ns(message.header.stamp), rotation)

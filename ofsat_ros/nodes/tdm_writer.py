@@ -15,11 +15,11 @@ import sys
 import threading
 import time
 from collections import Counter
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.node import Node
@@ -27,20 +27,30 @@ from sensor_msgs.msg import PointCloud2
 
 from ofsat_ros.camera import Astrometry
 from ofsat_ros.nodes import messages
+from ofsat_ros.nodes.diagnostics import Diagnostics
 from ofsat_ros.nodes.ros_parameters import NodeParameters
-from ofsat_ros.nodes.runtime import StartError, overridable_qos, parser_of, reliable, run
+from ofsat_ros.nodes.runtime import (
+    StartError,
+    overridable_qos,
+    parser_of,
+    qos_explained,
+    reliable,
+    run,
+    say,
+)
 from ofsat_ros.parameters import (
     CameraParameters,
-    ParameterError,
     Table,
     TdmWriterParameters,
     TrackingDataParameters,
 )
-from ofsat_ros.tracking_data import SUFFIXES, Arc, TrackArcs, write_arcs
+from ofsat_ros.timeline import AstrayError, Timeline
+from ofsat_ros.tracking_data import SUFFIXES, Arc, TrackArcs, remove_parts, write_arcs
 
-_DEPTH = 1000  # detections of so many frames may wait while a file is written
+_DEPTH = 1000  # detections of so many frames may wait to be taken
 _WARN_EVERY_S = 10.0
 _RETRY_S = 10.0
+_LAST_WRITES_S = 5.0  # patience at the end with a disk that hangs
 # No more images come when nothing was heard for so many times what lay between the last two
 # messages, but not before _RETRY_S: neither slow cameras nor slow players shall end the tracks.
 _SILENT_INTERVALS = 5
@@ -90,29 +100,34 @@ class TdmWriter(Node):
         self._arcs = TrackArcs(
             self._settings[TrackingDataParameters], [own.format], own.longest_directions
         )
+        self._timeline = Timeline()
         self._heard_s, self._interval_s = -math.inf, math.inf  # last message, and from its last
         self._folder = Path(own.output or datetime.now(UTC).strftime("tracks_%Y%m%d_%H%M%S"))
         _claim(self._folder)
         self._waiting: list[Arc] = []  # ended, and not yet written
         self._counts: Counter[str] = Counter()
         self._why_waiting = ""
-        # Callbacks and close() come from two threads.
+        # Callbacks, close() and the thread that writes share what stands above.
         self._lock = threading.Lock()
+        self._to_write = threading.Event()
         self._closed = False
+        # No callback waits for a disk: heartbeat and detections go on while it hangs.
+        self._thread = threading.Thread(target=self._write, name="tdm_writer", daemon=True)
+        self._thread.start()
         subscription = self.create_subscription(
             PointCloud2,
             "rso_detections",
             self._on_detections,
             reliable(_DEPTH),
+            event_callbacks=qos_explained(self, "rso_detections"),
             qos_overriding_options=overridable_qos(),
         )
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._diagnostics = Diagnostics(self, "tracking data")
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0, self._publish_diagnostics, clock=steady)
         self.create_timer(_RETRY_S, self._on_timer, clock=steady)
-        self.get_logger().info(
-            f"writing the tracks of {subscription.topic_name} into {self._folder}"
-        )
+        self._topic = subscription.topic_name
+        self.get_logger().info(f"writing the tracks of {self._topic} into {self._folder}")
 
     def close(self) -> None:
         """Write what is still open, and say what there is."""
@@ -121,15 +136,18 @@ class TdmWriter(Node):
                 return
             self._closed = True
             self._waiting += self._arcs.take_all()
-            self._write_waiting()
+        self._to_write.set()
+        self._thread.join(_LAST_WRITES_S)
+        with self._lock:
             if self._waiting:
                 self.exit_code = 1
-                sys.stderr.write(
-                    f"tdm_writer: {_in_words(len(self._waiting))} lost: {self._why_waiting}\n"
-                )
+                if not self._why_waiting:
+                    self._why_waiting = f"{self._folder} cannot be written: its disk hangs"
+                lost = _in_words(len(self._waiting))
+                say(f"tdm_writer: {lost} lost: {self._why_waiting}", sys.stderr)
             elif self._only_without_direction():
-                sys.stderr.write(f"tdm_writer: {_NO_DIRECTIONS}\n")
-            _say(f"{_in_words(self._counts['tracks'])} written into {self._folder}")
+                say(f"tdm_writer: {_NO_DIRECTIONS}", sys.stderr)
+            say(f"{_in_words(self._counts['tracks'])} written into {self._folder}")
 
     def _on_change(self, table: Table) -> None:
         with self._lock:
@@ -153,17 +171,22 @@ class TdmWriter(Node):
         with self._lock:
             if self._closed:
                 return
-            self._count(rows)
-            stamp_ns = self._astrometry.middle_ns(messages.stamp_ns(cloud.header.stamp))
-            self._arcs.add(stamp_ns, rows)
-            ended = self._arcs.take_ended(self._ended_after_s)
-            self._waiting += ended
-            if ended:
-                self._write_waiting()
             now_s = time.monotonic()
             self._interval_s, self._heard_s = now_s - self._heard_s, now_s
+            self._count(rows)
+            stamp_ns = self._astrometry.middle_ns(messages.stamp_ns(cloud.header.stamp))
+            try:
+                self._timeline.follow(stamp_ns)
+            except AstrayError:  # as the detector, which says so
+                self._counts["frames_left_out"] += 1
+                return
+            self._arcs.add(stamp_ns, rows)
+            if ended := self._arcs.take_ended(self._ended_after_s):
+                self._waiting += ended
+                self._to_write.set()
 
     def _count(self, rows: np.ndarray) -> None:
+        self._counts["frames"] += 1
         of_tracks = rows[rows["track_id"] > 0]
         known = np.isfinite(of_tracks["ra"]) & np.isfinite(of_tracks["dec"])
         self._counts["detections"] += len(of_tracks)
@@ -182,56 +205,68 @@ class TdmWriter(Node):
             longest_s = max(self._ended_after_s, _RETRY_S, _SILENT_INTERVALS * self._interval_s)
             if time.monotonic() - self._heard_s > longest_s:
                 self._waiting += self._arcs.take_all()
+            self._to_write.set()
+
+    def _write(self) -> None:
+        """Write whenever there is something, and a last time when the node is closed."""
+        closed = False
+        while not closed:
+            self._to_write.wait()
+            self._to_write.clear()
+            with self._lock:
+                closed = self._closed
             self._write_waiting()
 
     def _write_waiting(self) -> None:
         """Write what has ended; keep what cannot be written, and say why, once."""
-        while self._waiting:
-            arc = self._waiting[0]
+        while True:
+            with self._lock:
+                if not self._waiting:
+                    return
+                arc, parameters = self._waiting[0], self._arcs.parameters
             path = _free(self._folder, arc, SUFFIXES[self._format])
             try:
-                write_arcs(path, [arc], self._format, self._arcs.parameters)
+                write_arcs(path, [arc], self._format, parameters)
             except FileExistsError:  # another writer has just taken the name
                 continue
-            except (OSError, ParameterError) as error:
+            # Whatever it is, the thread must go on: the next track may be written.
+            except Exception as error:  # noqa: BLE001
                 why = f"{path} cannot be written: {getattr(error, 'strerror', None) or error}"
                 if not self._why_waiting:
                     self.get_logger().error(f"{why}; its track is kept and tried again")
                 self._why_waiting = why
                 return
-            del self._waiting[0]
-            self._why_waiting = ""
-            self._counts["tracks"] += 1
-            _say(f"{path}: {len(arc.rows)} directions of track {arc.label}")
+            with self._lock:
+                del self._waiting[0]
+                self._why_waiting = ""
+                self._counts["tracks"] += 1
+            say(f"{path}: {len(arc.rows)} directions of track {arc.label}")
 
     def _publish_diagnostics(self) -> None:
         with self._lock:
             counts, waiting, why = self._counts.copy(), len(self._waiting), self._why_waiting
-            problems = [f"{_in_words(waiting)} waiting: {why}"] if waiting else []
-            if self._only_without_direction():
-                problems.append(_NO_DIRECTIONS)
+            errors = [f"{_in_words(waiting)} waiting: {why}"] if waiting else []
+            warnings = [_NO_DIRECTIONS] if self._only_without_direction() else []
+        if not self.count_publishers(self._topic):
+            errors.append(f"nobody publishes {self._topic}: is the detector running?")
         values = {
             "tracks_written": counts["tracks"],
             "tracks_waiting": waiting,
+            "frames": counts["frames"],
+            "frames_left_out": counts["frames_left_out"],
             "detections": counts["detections"],
             "detections_without_direction": counts["without_direction"],
             "folder": self._folder,
         }
-        status = messages.diagnostic(
-            f"{self.get_fully_qualified_name()}: tracking data",
-            problems,
-            f"{_in_words(counts['tracks'])} written",
-            values,
-        )
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(array)
+        self._diagnostics.say(f"{_in_words(counts['tracks'])} written", values, errors, warnings)
 
 
 def _claim(folder: Path) -> None:
     """Make the folder; what it holds is never touched."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        with suppress(OSError):  # what cannot be removed harms nobody
+            remove_parts(folder)
     except OSError as error:
         raise StartError(
             f"{folder} cannot be made: {error.strerror}; choose another folder with"
@@ -254,11 +289,6 @@ def _free(folder: Path, arc: Arc, suffix: str) -> Path:
 
 def _in_words(tracks: int) -> str:
     return f"{tracks} track{'s' * (tracks != 1)}"
-
-
-def _say(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 def main() -> int:
