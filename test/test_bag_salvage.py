@@ -1,6 +1,7 @@
 """Torn and damaged bags give every message that is whole, and say what is not."""
 
 import re
+import resource
 import shutil
 import sqlite3
 
@@ -25,7 +26,9 @@ from ofsat_ros.recordings import IMAGE, Bag, BagWriter, RecordingError, open_rec
 COUNT = 30
 NUMBERS = range(COUNT)
 CHUNK, MESSAGES_IN_CHUNK = 20_000, 5
-CUTS = 40
+CUTS, MANY_CUTS = 40, 200
+# What recorders of today write by default.
+COMMON = ("mcap records", "mcap chunks", "sqlite")
 ZSTD = re.escape(b"\x28\xb5\x2f\xfd")  # how its frames begin
 ORIGINAL = {stamp_of(n): cdr_of(n) for n in NUMBERS}
 
@@ -123,11 +126,12 @@ def test_a_whole_file_is_given_without_a_word(whole):
     assert problems == []
 
 
-def test_a_file_cut_anywhere_gives_what_is_before_the_cut(whole, ends, tmp_path):
+def test_a_file_cut_anywhere_gives_what_is_before_the_cut(kind, whole, ends, tmp_path):
     assert len(ends) == COUNT
     data = whole.read_bytes()
     rng = np.random.default_rng(1)
-    cuts = [*rng.integers(0, len(data), CUTS), 0, 1, len(data) - 1]
+    count = MANY_CUTS if kind in COMMON else CUTS
+    cuts = [*rng.integers(0, len(data), count), 0, 1, len(data) - 1]
     cuts += [end + off for end in list(ends.values())[::6] for off in (-1, 0, 1)]
     for cut in sorted(cuts):
         torn = tmp_path / whole.name
@@ -156,6 +160,32 @@ def test_a_file_damaged_anywhere_is_read_without_an_unexpected_error(kind, whole
             assert before <= set(given), f"damaged at {begin}"
         if kind in ("mcap chunks", "mcap lz4", "mcap zstd"):
             assert_messages_are_the_original(given)
+
+
+# Numbers of bytes that no memory holds, as a length may tell after a flipped bit.
+BOMBS = [(1 << 60).to_bytes(8, "little"), b"\xff" * 8, b"\xff\xff\xff\x7f", b"\xff" * 4]
+MOST_KB = 50 << 10  # the files here have 0.15 MB
+
+
+def test_no_length_and_no_flipped_bit_takes_memory_or_time(whole, tmp_path):
+    data = whole.read_bytes()
+    rng = np.random.default_rng(3)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for i in range(CUTS):
+        damaged = bytearray(data)
+        # Where lengths are: mostly at the begin, and in the index at the end.
+        part = (len(data), 9000, 300)[i % 3]
+        at = int(rng.integers(0, part))
+        at = len(data) - 1 - at if i % 7 == 0 else at
+        if i % 2:
+            bomb = BOMBS[i // 2 % len(BOMBS)]
+            damaged[at : at + len(bomb)] = bomb
+        else:
+            damaged[at] ^= 1 << int(rng.integers(8))
+        file = tmp_path / whole.name
+        file.write_bytes(damaged)
+        given_or_nothing(file)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < MOST_KB
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])

@@ -322,7 +322,9 @@ def test_an_output_that_cannot_be_made(small: Path):
 def test_a_file_that_cannot_be_written(small: Path, tmp_path: Path):
     (tmp_path / "star_field.csv").mkdir()
     said = fails(1, "process", small, "-o", tmp_path, "--force")
-    assert said.startswith(f"ofsat: {tmp_path}/star_field.csv is not replaced, since it is no bag")
+    assert said.startswith(
+        f"ofsat: {tmp_path}/star_field.csv is not replaced, since it is a folder"
+    )
 
 
 def test_a_disk_that_is_full_ends_with_a_reason(small: Path, tmp_path: Path, monkeypatch):
@@ -526,7 +528,7 @@ def test_an_interruption_leaves_whole_files(tmp_path: Path):
     image = moving(2, 512)
     write(tmp_path / "bag", [image[i % 2] for i in range(300)])
     program = subprocess_ofsat("process", tmp_path / "bag", "-o", tmp_path / "out", "--bag")
-    wait_for_lines(tmp_path / "out/star_field.csv", 4, program)
+    wait_for_lines(tmp_path / "out/unfinished/star_field.csv", 4, program)
     program.send_signal(signal.SIGINT)
     out, err = program.communicate(timeout=60)
     assert program.returncode == 130, err
@@ -557,7 +559,8 @@ def test_an_interruption_leaves_a_whole_bag(tmp_path: Path):
     bag = tmp_path / "bag"
     program = subprocess_ofsat("simulate", "-o", bag, "--frames", 5000, "--size", 256, 256)
     deadline = time.monotonic() + 60
-    while sum(f.stat().st_size for f in bag.glob("*.mcap")) < 3 * 256 * 256 * 2:
+    made = tmp_path / "bag.unfinished" / "bag"
+    while sum(f.stat().st_size for f in made.glob("*.mcap")) < 3 * 256 * 256 * 2:
         assert program.poll() is None, program.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.01)

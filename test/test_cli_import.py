@@ -244,7 +244,8 @@ def test_ctrl_c_leaves_a_whole_bag(tmp_path: Path):
     output = tmp_path / "bag"
     program = subprocess_ofsat("import", tmp_path / "long", "-o", output)
     deadline = time.monotonic() + 60
-    while sum(file.stat().st_size for file in output.glob("*.mcap")) < 3 * pixels.nbytes:
+    made = tmp_path / "bag.unfinished" / "bag"
+    while sum(file.stat().st_size for file in made.glob("*.mcap")) < 3 * pixels.nbytes:
         assert program.poll() is None, program.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.005)

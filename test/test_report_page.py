@@ -301,10 +301,16 @@ def test_pixels_that_are_missing_cost_no_picture(tmp_path: Path):
 def test_stamps_that_are_all_the_same_are_told_in_few_words(tmp_path: Path):
     results = processed(tmp_path, images_of("empty", 1, 12), step_ns=0)
     words = text_of(write_report(results))
-    assert words.count("starts afresh: two frames have the same stamp") == 5
-    assert "6 more frames start afresh: star_field.csv says why" in words
+    assert words.count("left out, and others like it: it has the same stamp as the frame") == 1
     assert "<dt>between frames</dt><dd>\u2013 s</dd>" in words
     assert alts(words) == ["Frame: a single frame: there is no other to lay on it"]
+
+
+def test_frames_that_all_start_afresh_are_told_in_few_words(tmp_path: Path):
+    results = processed(tmp_path, images_of("empty", 1, 12), step_ns=700 * 10**9)
+    words = text_of(write_report(results))
+    assert words.count("starts afresh: a gap of 700 s is longer than max_gap_s") == 5
+    assert "6 more frames start afresh: star_field.csv says why" in words
 
 
 def test_sky_without_rso_says_why(tmp_path: Path):

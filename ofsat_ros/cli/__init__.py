@@ -4,7 +4,8 @@ Each command is a module of this package, which is imported only when it is call
 what they share: words to the user, options out of the parameters' tables.  Exit code 0: done; 1:
 the input or output is not usable, or a mistake of ours; 2: bad usage; 130: stopped by Ctrl-C, with
 what was done so far on disk.  The summary goes to standard output; progress, notes and errors to
-standard error.  ``--debug`` shows the tracebacks that are kept from users.
+standard error.  Whoever ends the program from outside, or closes its terminal, stops it as
+Ctrl-C does.  ``--debug`` shows the tracebacks that are kept from users.
 """
 
 from __future__ import annotations
@@ -12,13 +13,16 @@ from __future__ import annotations
 import importlib
 import io
 import keyword
+import signal
 import sys
+import threading
 from typing import Any
 
 import click
 from click.shell_completion import CompletionItem
 
 from ofsat_ros import __version__
+from ofsat_ros.printing import printable
 
 __all__ = ["main"]
 
@@ -71,6 +75,7 @@ class _Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; no mistake of ours gives a traceback that nobody asked for."""
+        _end_as_by_ctrl_c()
         try:
             return super().invoke(ctx)
         except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
@@ -92,9 +97,18 @@ class _Commands(click.Group):
             if ctx.params["debug"]:
                 raise
             raise _Failure(
-                f"ofsat: {type(error).__name__}: {error}\nThis is a mistake in ofsat, not in what"
-                " you did. `ofsat --debug` in place of `ofsat` shows where, for your report of it."
+                f"ofsat: {type(error).__name__}: {printable(f'{error}')}\nThis is a mistake in"
+                " ofsat, not in what you did. `ofsat --debug` in place of `ofsat` shows where, for"
+                " your report of it."
             ) from error
+
+
+def _end_as_by_ctrl_c() -> None:
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            # Not what was told to stay: `nohup` means it.
+            if signal.getsignal(number) == signal.SIG_DFL:
+                signal.signal(number, signal.default_int_handler)
 
 
 @click.group(

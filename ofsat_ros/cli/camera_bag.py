@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,7 +10,8 @@ import click
 import numpy as np
 
 from ofsat_ros.camera import Camera
-from ofsat_ros.recordings import Attitude, BagWriter
+from ofsat_ros.cli.unfinished import Unfinished
+from ofsat_ros.recordings import Attitude, BagWriter, RecordingError
 
 IMAGE_TOPIC = "/camera/image_raw"
 CAMERA_INFO_TOPIC, ATTITUDE_TOPIC = "/camera/camera_info", "/camera/attitude"
@@ -21,7 +23,7 @@ class CameraBag(BagWriter):
 
     Parameters
     ----------
-    path, storage, force
+    path, storage
         As in `BagWriter`.
     compressed : bool
         Write the images as PNG, in CompressedImage messages.
@@ -38,8 +40,8 @@ class CameraBag(BagWriter):
         As `BagWriter`; so do the methods.
     """
 
-    def __init__(self, path: Path, storage: str, compressed: bool, force: bool) -> None:
-        super().__init__(path, storage=storage, compression="none", force=force)
+    def __init__(self, path: Path, storage: str, compressed: bool) -> None:
+        super().__init__(path, storage=storage, compression="none")
         self._compressed = compressed
         self.image_topic = f"{IMAGE_TOPIC}/compressed" if compressed else IMAGE_TOPIC
         self.frames = 0
@@ -55,6 +57,33 @@ class CameraBag(BagWriter):
             self.write_camera_info(CAMERA_INFO_TOPIC, camera, stamp_ns, FRAME_ID)
         self.write_image(self.image_topic, image, stamp_ns, FRAME_ID, compressed=self._compressed)
         self.frames += 1
+
+
+def bag_folder(path: Path, force: bool) -> Unfinished:
+    """Return where to make a bag, by its name, for a path.
+
+    Raises
+    ------
+    RecordingError
+        If something is there that is not to be replaced.
+    """
+    if os.path.lexists(path) and not force:
+        raise RecordingError(f"{path} exists: choose another path, or --force to replace it")
+    if path.name in ("", ".."):
+        raise RecordingError(f"{path} is not replaced, since it is no bag: choose another path")
+    return Unfinished(
+        path.with_name(f"{path.name}.unfinished"), path.parent, [f"{path.name}/"], force
+    )
+
+
+def left(work: Unfinished | None, bag: CameraBag | None, failed: bool = False) -> str:
+    """Say what there is of a bag that was not made to its end."""
+    if work is None or bag is None or not bag.frames:
+        return "nothing is written"
+    # How many reached the disk is known of a bag alone that could be closed.
+    count = "what could be written is" if failed else f"{bag.frames} frames are"
+    words = f"{count} in {work.folder / bag.path.name}"
+    return f"{words}, and the earlier bag is as it was" if work.kept else words
 
 
 def bag_options(command: Callable[..., None]) -> Callable[..., None]:

@@ -10,8 +10,14 @@ from typing import Any
 import click
 from tqdm import tqdm
 
-from ofsat_ros.cli.camera_bag import CameraBag, bag_options
-from ofsat_ros.cli.terminal import fail, help_all, recording_options, say
+from ofsat_ros.cli.camera_bag import CameraBag, bag_folder, bag_options, left
+from ofsat_ros.cli.terminal import (
+    fail,
+    help_all,
+    recording_options,
+    say,
+    spare_input,
+)
 from ofsat_ros.recordings import RecordingError, open_recording
 
 _NOTES_SHOWN = 10
@@ -44,9 +50,9 @@ def command(
     INPUT is what process reads: FITS, SER, a video, images, another bag; a file, or a folder of
     them.  Several INPUTs of one kind are one recording.  Colour becomes luminance.
     """
-    bag = None
+    work = bag = None
     try:
-        _check(recordings, output)
+        spare_input(recordings, output)
         with (
             open_recording(recordings, **options) as recording,
             tqdm(
@@ -61,29 +67,22 @@ def command(
                 fail("no frame could be read; nothing is written")
             if compressed and first.image.dtype.kind == "f":
                 fail("PNG cannot hold these images, which are of floats: leave out --compressed")
-            with CameraBag(output, storage, compressed, force) as bag:
+            work = bag_folder(output, force)
+            with work, CameraBag(work.folder / output.name, storage, compressed) as bag:
                 for frame in chain([first], frames):
                     bag.add_attitudes(frame.attitudes)
                     bag.add_frame(frame.image, frame.stamp_ns, frame.camera)
+                    work.filled = True
                     bar.update()
                 bag.add_attitudes(recording.last_attitudes)
     except (RecordingError, OSError) as error:
-        fail(error)
+        fail(error, f"; {left(work, bag, failed=True)}" if bag else "")
     except KeyboardInterrupt:
-        done = f"{bag.frames} frames are in {output}" if bag else "nothing is written"
-        say(f"stopped; {done}")
+        say(f"stopped; {left(work, bag)}")
         sys.exit(130)
     _tell(recording.problems)
     words = f" ({recording.skipped} more could not be read)" if recording.skipped else ""
     click.echo(f"{bag.frames} frames{words} on {bag.image_topic} are in {output}")
-
-
-def _check(recordings: tuple[Path, ...], output: Path) -> None:
-    """Refuse to write over what is read."""
-    target = output.resolve()
-    for path in recordings:
-        if target in (path.resolve(), *path.resolve().parents):
-            raise RecordingError(f"{path} is read, so it cannot be the output: choose another one")
 
 
 def _tell(notes: list[str]) -> None:

@@ -20,6 +20,7 @@ from ofsat_ros.cli.terminal import (
     recording_argument,
     recording_options,
 )
+from ofsat_ros.printing import printable
 from ofsat_ros.recordings import RecordingError, Topic, TopicError, open_recording
 
 _PATHS_SHOWN = 3
@@ -58,7 +59,9 @@ def command(paths: tuple[Path, ...], as_json: bool, **options: Any) -> None:
         problem = f"{error}"
     told["problem"] = problem
     told["processable"] = any(not about["hindrance"] for about in told["images"])
-    click.echo(json.dumps(told, indent=2) if as_json else "\n".join(_words(told, paths)))
+    click.echo(
+        json.dumps(told, indent=2) if as_json else "\n".join(map(printable, _words(told, paths)))
+    )
     if any(about["stopped"] for about in told["images"]):
         sys.exit(130)
     sys.exit(0 if told["processable"] else 1)

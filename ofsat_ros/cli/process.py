@@ -16,7 +16,6 @@ import click
 from ofsat_ros import __version__
 from ofsat_ros.camera import Astrometry
 from ofsat_ros.cli.terminal import (
-    claim,
     fail,
     help_all,
     in_words,
@@ -25,7 +24,9 @@ from ofsat_ros.cli.terminal import (
     recording_argument,
     recording_options,
     say,
+    spare_input,
 )
+from ofsat_ros.cli.unfinished import Unfinished
 from ofsat_ros.parameters import (
     DEFAULT_PRESET,
     CameraParameters,
@@ -51,6 +52,8 @@ from ofsat_ros.results import (
 from ofsat_ros.results.bag import BAG, ResultBag
 from ofsat_ros.tracking_data import TRACKING_DATA, TrackArcs
 
+# Where the files are while they are made, in the folder that they are for.
+UNFINISHED = "unfinished"
 # Options with which the same frames are opened again.
 _SOURCE = ("topic", "camera_info_topic", "attitude_topic", "fps", "exposure_s", "start_ns")
 
@@ -130,6 +133,8 @@ def command(
         raise click.UsageError(str(error)) from error
     start_s, started = time.monotonic(), datetime.now(UTC).isoformat(timespec="seconds")
     processing = Processing(Pipeline(parameters), astrometry, arcs, live, say)
+    totals = processing.totals
+    work: Unfinished | None = None
     made = [DETECTIONS, TRACKS, STAR_FIELD, *([f"{BAG}/"] if bag else [])]
     run: dict[str, Any] = {
         **{"version": __version__, "preset": preset, "live": live, "started_utc": started},
@@ -140,56 +145,69 @@ def command(
         with ExitStack() as stack:
             source = {name: options[name] for name in _SOURCE}
             frames = stack.enter_context(open_recording(paths, **source))
-            _claim(output, bag, video, force)
-            writer = stack.enter_context(ResultWriter(output))
+            work = stack.enter_context(_work_folder(paths, output, bag, video, force))
+            writer = stack.enter_context(ResultWriter(work.folder))
             scale = DetectorParameters().marker_scale
-            results = stack.enter_context(ResultBag(output, scale)) if bag else None
+            results = stack.enter_context(ResultBag(work.folder, scale)) if bag else None
             try:
                 processing.run(frames, writer, results)
                 run["stopped"] = False
             finally:
                 # Also when stopped: whole, with what was done.
-                made += _write_arcs(arcs, output, formats, processing.note)
-                run |= source | _origin(paths, frames) | processing.totals.as_dict()
+                work.filled = totals.frames > 0
+                made += _write_arcs(arcs, work.folder, formats, processing.note)
+                run |= source | _origin(paths, frames) | totals.as_dict()
                 run["seconds"] = time.monotonic() - start_s
-                write_run(output, run)
-        if processing.totals.frames:
+                write_run(work.folder, run)
+        if totals.frames:
             made += _write_report(output, report, video)
             write_run(output, run)
     except (RecordingError, OSError) as error:
-        fail(error)
+        there = work is not None and work.folder.is_dir() and totals.frames
+        fail(error, f"; {_left(totals, work)}" if there else "")
     except KeyboardInterrupt:
-        say(_stopped(processing.totals, output, done=not run["stopped"]))
+        say(f"stopped; {_left(totals, work, run['stopped'], hint=True)}")
         sys.exit(130)
-    if not processing.totals.frames:
+    if not totals.frames:
         fail(f"no frame of {frames.path} could be processed")
     if as_json:
         click.echo(json.dumps(run, indent=2, ensure_ascii=False))
         return
     *first, last = (name for name in made if name != f"{video}")
     film = f", the video is {video}" if video else ""
-    click.echo(f"{processing.totals}; {', '.join(first)} and {last} are in {output}{film}")
+    click.echo(f"{totals}; {', '.join(first)} and {last} are in {output}{film}")
     if profile:
-        click.echo(processing.totals.profile())
+        click.echo(totals.profile())
 
 
-def _claim(output: Path, bag: bool, video: Path | None, force: bool) -> None:
-    """Make way for all that is written, or refuse."""
-    if video is not None and video.exists() and not force:
-        raise RecordingError(f"{video} exists: choose another name, or --force to replace it")
-    files = [DETECTIONS, TRACKS, STAR_FIELD, *TRACKING_DATA.values(), REPORT, RUN]
+def _work_folder(
+    paths: tuple[Path, ...], output: Path, bag: bool, video: Path | None, force: bool
+) -> Unfinished:
+    """Return where to make the results, or refuse if others are in their place."""
+    if video is not None:
+        spare_input(paths, video)
+        if video.exists() and not force:
+            raise RecordingError(f"{video} exists: choose another name, or --force to replace it")
+    names = [DETECTIONS, TRACKS, STAR_FIELD, *TRACKING_DATA.values(), REPORT]
     # A folder of that name is another's, unless it is a bag.
     if bag or (output / BAG / "metadata.yaml").exists():
-        files.append(BAG)
-    claim(output, files, force)
+        names.append(f"{BAG}/")
+    names.append(RUN)  # the last one: what is there without it is not whole
+    for name in names:
+        spare_input(paths, output / name)
+    return Unfinished(output / UNFINISHED, output, names, force)
 
 
-def _stopped(totals: Totals, output: Path, done: bool) -> str:
-    """Say what is there after Ctrl-C, and what is still to be had of it."""
-    if not totals.frames:
-        return "stopped; no frame was processed"
-    far = "" if done else " so far"
-    return f"stopped; {totals}{far}, in {output}; `ofsat report {output}` makes a page of it"
+def _left(
+    totals: Totals, work: Unfinished | None, stopped: bool = True, hint: bool = False
+) -> str:
+    """Say what is there of a run that did not end, and what is still to be had of it."""
+    if work is None or not totals.frames:
+        return "no frame was processed"
+    words = f"{totals}{' so far' * stopped}, in {work.folder}"
+    if work.kept:
+        words += "; the earlier results are as they were"
+    return f"{words}; `ofsat report {work.folder}` makes a page of it" if hint else words
 
 
 def _origin(paths: tuple[Path, ...], frames: Recording) -> dict[str, Any]:

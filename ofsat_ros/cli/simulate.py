@@ -9,7 +9,7 @@ from typing import Any
 import click
 from tqdm import tqdm
 
-from ofsat_ros.cli.camera_bag import CameraBag, bag_options
+from ofsat_ros.cli.camera_bag import CameraBag, bag_folder, bag_options, left
 from ofsat_ros.cli.terminal import fail, say
 from ofsat_ros.parameters import ParameterError
 from ofsat_ros.recordings import RecordingError
@@ -62,18 +62,24 @@ def command(
     except ParameterError as error:
         raise click.UsageError(str(error)) from error
     truth = Path(f"{output}.truth.csv")
-    rows = []
+    work = bag = None
+    rows: list[Any] = []
     try:
-        with CameraBag(output, storage, compressed, force) as bag:
+        work = bag_folder(output, force)
+        with work, CameraBag(work.folder / output.name, storage, compressed) as bag:
             for frame in tqdm(sky, total=len(sky), unit=" frames", disable=None):
                 bag.add_attitudes(((frame.stamp_ns, frame.attitude),))
                 bag.add_frame(frame.image, frame.stamp_ns, sky.camera)
                 rows.append(frame.truth)
+                work.filled = True
         write_truth(truth, rows)
     except (RecordingError, OSError) as error:
-        fail(error)
+        fail(error, f"; {left(work, bag, failed=True)}" if bag else "")
     except KeyboardInterrupt:
-        write_truth(truth, rows)
-        say(f"stopped; {len(rows)} frames are in {output}, their truth in {truth}")
+        words = left(work, bag)
+        if rows and work and not work.kept:  # or the truth there is of the earlier bag
+            write_truth(truth, rows)
+            words += f", their truth in {truth}"
+        say(f"stopped; {words}")
         sys.exit(130)
     click.echo(f"{len(rows)} frames on {bag.image_topic} are in {output}, their truth in {truth}")

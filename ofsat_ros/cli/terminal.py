@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
@@ -13,7 +13,8 @@ import click
 from tqdm import tqdm
 
 from ofsat_ros.parameters import Description, Table
-from ofsat_ros.recordings import RecordingError, remove_bag, utc_ns, utc_text
+from ofsat_ros.printing import printable
+from ofsat_ros.recordings import RecordingError, utc_ns, utc_text
 
 _Command = Callable[..., None]
 _ALL = f"{__name__}.all"
@@ -145,25 +146,25 @@ def of_table(table: type[Table], given: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in given.items() if name in names}
 
 
-def claim(folder: Path, files: list[str], force: bool) -> None:
-    """Make the folder for the results, or refuse to overwrite those that it holds."""
-    folder.mkdir(parents=True, exist_ok=True)
-    old = [name for name in files if (folder / name).exists()]
-    if old and not force:
-        raise RecordingError(
-            f"{folder} already holds {', '.join(old)}; choose another folder, or --force to"
-            " replace them"
-        )
-    # What is not made this time must not stay beside what is.
-    for path in (folder / name for name in old):
-        remove_bag(path) if path.is_dir() else path.unlink()
+def spare_input(recordings: Sequence[Path], target: Path) -> None:
+    """Refuse to write over what is read.
+
+    Raises
+    ------
+    RecordingError
+        If a recording is the target, or is in it.
+    """
+    resolved = target.resolve()
+    for path in recordings:
+        if resolved in (path.resolve(), *path.resolve().parents):
+            raise RecordingError(f"{path} is read, so it cannot be the output: choose another one")
 
 
-def fail(error: Exception | str) -> NoReturn:
-    """End the command with exit code 1 and a line that says why."""
+def fail(error: Exception | str, left: str = "") -> NoReturn:
+    """End the command with exit code 1 and a line that says why, and what is left."""
     if isinstance(error, Exception) and debugging():
         traceback.print_exception(error)
-    say(f"ofsat: {in_words(error)}")
+    say(f"ofsat: {in_words(error)}{left}")
     sys.exit(1)
 
 
@@ -182,4 +183,4 @@ def debugging() -> bool:
 
 def say(line: str) -> None:
     """One line on standard error, beside the progress bar."""
-    tqdm.write(line, file=sys.stderr)
+    tqdm.write("\n".join(map(printable, line.split("\n"))), file=sys.stderr)

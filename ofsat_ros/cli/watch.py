@@ -34,4 +34,4 @@ def command(namespace: str) -> None:
         )
     there = ["--ros-args", "-r", f"__ns:=/{namespace.strip('/')}"]
     # A node is a process: this one becomes it, and Ctrl-C reaches it alone.
-    os.execv(sys.executable, [sys.executable, "-m", "ofsat_ros.nodes.watch", *there])
+    os.execv(sys.executable, [sys.executable, "-m", "ofsat_ros.nodes.start", "watch", *there])

@@ -23,7 +23,8 @@ from ofsat_ros.recordings.bag import (
     Topic,
     TopicError,
 )
-from ofsat_ros.recordings.bag_writer import BagWriter, remove_bag
+from ofsat_ros.recordings.bag_writer import BagWriter, check_bag, remove_bag
+from ofsat_ros.recordings.held import HeldError, hold
 from ofsat_ros.recordings.kinds import source_of
 from ofsat_ros.recordings.messages import header_message, message_type
 from ofsat_ros.recordings.recording import Attitude, Frame, Recording
@@ -38,11 +39,14 @@ __all__ = [
     "Bag",
     "BagWriter",
     "Frame",
+    "HeldError",
     "Recording",
     "RecordingError",
     "Topic",
     "TopicError",
+    "check_bag",
     "header_message",
+    "hold",
     "message_type",
     "open_recording",
     "remove_bag",

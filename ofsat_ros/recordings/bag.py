@@ -37,7 +37,14 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 ATTITUDE = "geometry_msgs/msg/QuaternionStamped"
 
 _METADATA = "metadata.yaml"
+# What damaged metadata raises; the last, if it is nested without an end.
+_NOT_METADATA = (
+    *(yaml.YAMLError, UnicodeDecodeError, LookupError, TypeError, ValueError),
+    *(AttributeError, RecursionError),
+)
 _ZSTD = b"\x28\xb5\x2f\xfd"  # never the first bytes of CDR
+# No image is larger; a few bytes may unpack to any number.
+_MOST_BYTES = 1 << 30
 # How a recorder names the files of a bag that it splits.
 _SPLIT = re.compile(r"(?P<bag>.+)_(?P<number>\d+)(?:\.mcap|\.db3|\.bag)(?:\.zstd|\.active)?")
 
@@ -176,7 +183,7 @@ class Bag:
         """Return a message as ROS 2 serializes it; None if it is damaged, which is said."""
         try:
             if data[:4] == _ZSTD:
-                data = zstd.decompress(data)
+                data = _unpacked(data)
             if channel.encoding == "ros1":
                 data = bytes(self._typestore.ros1_to_cdr(data, channel.msgtype))
         # Damaged bytes: the decompressor's own error, struct, key, index errors and others.
@@ -231,7 +238,7 @@ class Bag:
         except FileNotFoundError:
             self.problems.append(f"{self.path} has no {_METADATA} (was the recorder killed?)")
             return None
-        except (yaml.YAMLError, UnicodeDecodeError, LookupError, TypeError, ValueError) as error:
+        except _NOT_METADATA as error:
             reason = f"{error}".partition("\n")[0]
             self.problems.append(f"{self.path / _METADATA} is damaged and not used: {reason}")
             return None
@@ -289,6 +296,14 @@ class Bag:
     def _unreadable(self, error: Exception, where: str = "") -> RecordingError:
         reason = f"{error}".rstrip(".") or type(error).__name__
         return RecordingError(f"cannot read {f'{self.path} {where}'.rstrip()}: {reason}")
+
+
+def _unpacked(data: bytes) -> bytes:
+    unpacker = zstd.ZstdDecompressor()
+    unpacked: bytes = unpacker.decompress(data, _MOST_BYTES)
+    if not unpacker.eof:
+        raise ValueError(f"it is cut short, or unpacks to more than {_MOST_BYTES >> 30} GiB")
+    return unpacked
 
 
 def _topics(storages: list[Storage], told: dict[str, Topic]) -> dict[str, Topic]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import sqlite3
 import threading
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Self
 
@@ -21,6 +23,8 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer, WriterError
+from rosbags.rosbag2.storage_mcap import McapWriter
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 from rosbags.typesys import TypesysError
 from scipy.spatial.transform import Rotation
 
@@ -44,6 +48,11 @@ _COMPRESSIONS = {
     "file": CompressionMode.FILE,
     "chunk": CompressionMode.STORAGE,
 }
+_FLUSH_EVERY_S = 1.0
+# Names of files of messages, of those that lie beside an open database, and of half-made ones.
+_STORED = re.compile(
+    rf"({'|'.join(map(re.escape, SUFFIXES))})(-journal|-wal|-shm|\.zstd(\.tmp)?)?$"
+)
 # What image publishers offer: any subscriber can have it, and nothing is kept for late ones.
 _FOREVER = QosTime(9223372036, 854775807)
 _QOS = Qos(
@@ -63,7 +72,8 @@ class BagWriter:
     """Writes a rosbag2 folder; a context manager.
 
     The bag is closed, and so is readable, also when an exception or Ctrl-C ends the ``with``; no
-    message is cut by it.
+    message is cut by it.  If the process is killed, all but the messages of the last second can
+    still be read.
 
     Parameters
     ----------
@@ -102,6 +112,7 @@ class BagWriter:
                 )
             remove_bag(self.path)
         self._connections: dict[str, Connection] = {}
+        self._flushed_s = time.monotonic()
         typestore()  # which takes a while, and Ctrl-C might come
         try:
             with _uninterrupted():
@@ -109,7 +120,7 @@ class BagWriter:
                 self._writer.set_compression(mode, CompressionFormat.ZSTD)
                 self._writer.open()
         except (OSError, WriterError) as error:
-            raise RecordingError(f"cannot write {self.path}: {error}") from error
+            raise RecordingError(f"cannot write {self.path}: {_reason(error)}") from error
         except KeyboardInterrupt:
             self.close()
             raise
@@ -128,7 +139,9 @@ class BagWriter:
         try:
             writer.close()
         except (OSError, sqlite3.Error) as error:
-            raise RecordingError(f"cannot finish {self.path}: {error}") from error
+            with suppress(Exception):  # it says the same again
+                writer.abort()
+            raise RecordingError(f"cannot finish {self.path}: {_reason(error)}") from error
 
     def write(self, topic: str, msgtype: str, data: bytes | memoryview, stamp_ns: int) -> None:
         """Write a serialized message.
@@ -163,10 +176,24 @@ class BagWriter:
                 raise RecordingError(f"{topic} holds {connection.msgtype}, not {msgtype}")
             with _uninterrupted():
                 self._writer.write(connection, int(stamp_ns), data)
+                self._flush()
         except TypesysError as error:
             raise RecordingError(f"{msgtype} is no message type known here: {error}") from error
         except (OSError, sqlite3.Error) as error:
-            raise RecordingError(f"cannot write {self.path}: {error}") from error
+            raise RecordingError(f"cannot write {self.path}: {_reason(error)}") from error
+
+    def _flush(self) -> None:
+        """Have the file hold what was written; not at each message, which would be slow."""
+        now_s = time.monotonic()
+        if now_s - self._flushed_s < _FLUSH_EVERY_S or self._writer is None:
+            return
+        self._flushed_s = now_s
+        storage = self._writer.storage
+        if isinstance(storage, McapWriter):
+            storage.close_chunk()
+            storage.bio.flush()
+        elif isinstance(storage, Sqlite3Writer):
+            storage.conn.commit()
 
     def write_image(
         self,
@@ -242,13 +269,24 @@ def _uninterrupted() -> Iterator[None]:
         yield  # where Ctrl-C never comes
         return
     came: list[int] = []
-    usual = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    # SIGTERM and the end of the terminal, too, where they do what Ctrl-C does.
+    usual = {
+        number: signal.signal(number, lambda number, _: came.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        if signal.getsignal(number) is signal.default_int_handler
+    }
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, usual or signal.SIG_DFL)
+        for number, handler in usual.items():
+            signal.signal(number, handler)
         if came:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(came[0])
+
+
+def _reason(error: Exception) -> str:
+    """Return what an error says, without numbers of the operating system."""
+    return f"{getattr(error, 'strerror', None) or error}"
 
 
 def _pick(word: str, known: dict[str, Any], what: str) -> Any:
@@ -258,26 +296,37 @@ def _pick(word: str, known: dict[str, Any], what: str) -> Any:
 
 
 def remove_bag(path: Path) -> None:
-    """Remove a bag's folder, and never anything else.
+    """Remove a bag's folder, and never anything else; raises as `check_bag`."""
+    for file in check_bag(path):
+        file.unlink()
+    path.rmdir()
+
+
+def check_bag(path: Path) -> list[Path]:
+    """Return the files of a bag's folder, one that its recorder did not finish included.
 
     Raises
     ------
     RecordingError
         If it is no bag, or holds something beside it.
     """
-    bag = path.is_dir() and not path.is_symlink() and (path / "metadata.yaml").exists()
-    inside = sorted(path.iterdir()) if bag else []
-    foreign = [f.name for f in inside if not (f.name == "metadata.yaml" or _is_storage(f))]
-    if not bag or foreign:
-        why = f"it also holds {', '.join(foreign)}" if foreign else "it is no bag"
+    is_folder = path.is_dir() and not path.is_symlink()
+    inside = sorted(path.iterdir()) if is_folder else []
+    foreign = [file.name for file in inside if not _is_of_bag(file)]
+    # What was not finished is known by its name: the folder's own.
+    known = (path / "metadata.yaml").exists() or all(
+        file.name.startswith((f"{path.name}.", "metadata.")) for file in inside
+    )
+    if not is_folder or not known or foreign:
+        why = f"it also holds {', '.join(foreign)}" if known and foreign else "it is no bag"
         raise RecordingError(f"{path} is not replaced, since {why}: remove it yourself")
-    for file in inside:
-        file.unlink()
-    path.rmdir()
+    return inside
 
 
-def _is_storage(path: Path) -> bool:
-    return path.is_file() and any(suffix in SUFFIXES for suffix in path.suffixes)
+def _is_of_bag(path: Path) -> bool:
+    return path.is_file() and (
+        path.name in ("metadata.yaml", "metadata.yaml.tmp") or bool(_STORED.search(path.name))
+    )
 
 
 def _encoding_of(image: np.ndarray) -> str:

@@ -83,6 +83,8 @@ def _find(path: Path) -> _Found:
     if not path.exists():
         raise RecordingError(f"{path} does not exist: check the path")
     if not path.is_dir():
+        if not path.is_file():
+            raise RecordingError(f"{path} is no file but a pipe or a device: copy it into a file")
         kind = _kind_of(path, [path.suffix.lower()])
         if not kind:
             raise RecordingError(
@@ -161,7 +163,8 @@ def _sorted_out(files: list[Path]) -> dict[str, list[Path]]:
     for file in files:
         if file.name.startswith(".") or not (kind := _kind_of(file, _UNTOLD)):
             continue
-        if not file.is_dir():  # a link to nowhere is to be told
+        # A link to nowhere is to be told; who opens a pipe or a device might wait for ever.
+        if file.is_file() or not file.exists():
             found[kind].append(file)
     return {kind: of_kind for kind, of_kind in found.items() if of_kind}
 

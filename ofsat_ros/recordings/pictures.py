@@ -177,10 +177,14 @@ def _exif(file: Path) -> dict[int, Any]:
         return {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of tags that are damaged
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         try:
             with Image.open(file) as picture:
                 return dict(picture.getexif().get_ifd(_EXIF))
         except (OSError, SyntaxError, ValueError, UnidentifiedImageError):
+            return {}
+        # Whether it is too large is said where its pixels are read.
+        except Image.DecompressionBombError:
             return {}
 
 

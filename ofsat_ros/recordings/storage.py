@@ -6,13 +6,16 @@ import importlib
 import sys
 from collections import Counter
 from collections.abc import Collection, Iterator
+from contextlib import ExitStack
+from errno import EDQUOT, EFBIG, ENOSPC
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from shutil import copyfileobj
 from typing import Any
 
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag2 import Reader as Rosbag2Reader
 
+from ofsat_ros.recordings.held import temporary_folder
 from ofsat_ros.recordings.salvage import Channel, Salvage, WreckError
 
 SUFFIXES = (".mcap", ".db3", ".bag")
@@ -63,20 +66,19 @@ class Storage:
 
     def __init__(self, path: Path, problems: list[str]) -> None:
         self._path, self._problems = path, problems
-        self._folder: TemporaryDirectory[str] | None = None
-        self._file = self._unpacked() if path.suffix == ".zstd" else path
         self._source: _Library | Salvage
-        try:
+        with ExitStack() as folder:
+            self._file = path
+            if path.suffix == ".zstd":
+                self._file = self._unpacked(folder.enter_context(temporary_folder()))
             self._source = self._open()
-        except BaseException:
-            self._remove_folder()
-            raise
+            self._folder = folder.pop_all()
         self.channels, self.start_ns = self._source.channels, self._source.start_ns
 
     def close(self) -> None:
         """Close the files, remove what was unpacked."""
-        self._source.close()
-        self._remove_folder()
+        with self._folder:
+            self._source.close()
 
     def messages(
         self, topics: Collection[str], start_ns: int | None
@@ -137,32 +139,29 @@ class Storage:
         self._problems.append(f"{self._path.name} {what} {found.count}")
         return found
 
-    def _unpacked(self) -> Path:
+    def _unpacked(self, folder: Path) -> Path:
         """Return where the file is without its compression, as far as that is whole."""
-        self._folder = TemporaryDirectory(prefix="ofsat_")
-        target = Path(self._folder.name, self._path.stem)
-        unpacker = zstd.ZstdDecompressor()
+        target = folder / self._path.stem
+        torn = ""
         try:
-            with self._path.open("rb") as packed, target.open("wb") as file:
-                while block := packed.read(_BLOCK):
-                    while block:
-                        if unpacker.eof:  # one more frame
-                            unpacker = zstd.ZstdDecompressor()
-                        file.write(unpacker.decompress(block))
-                        block = unpacker.unused_data
-            torn = "" if unpacker.eof else "it ends too early"
+            # Block by block: a small file may hold much.
+            with zstd.open(self._path) as packed, target.open("wb") as file:
+                copyfileobj(packed, file, _BLOCK)
+        except EOFError:
+            torn = "it ends too early"
         except zstd.ZstdError as error:
             torn = f"{error}"
-        except BaseException:
-            self._remove_folder()
-            raise
+        except OSError as error:
+            if error.errno not in (ENOSPC, EDQUOT, EFBIG):
+                raise
+            raise OSError(
+                error.errno,
+                f"there is no room in {folder.parent} to unpack it: set TMPDIR to a folder with"
+                " more of it",
+            ) from error
         if torn:
             self._problems.append(f"{self._path.name} could not be unpacked to its end: {torn}")
         return target
-
-    def _remove_folder(self) -> None:
-        if self._folder is not None:
-            self._folder.cleanup()
 
 
 class _Library:

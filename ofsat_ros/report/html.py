@@ -8,7 +8,6 @@ template.
 from __future__ import annotations
 
 import base64
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from ofsat_ros.report.again import open_again, processed
 from ofsat_ros.report.charts import Series, chart, sparkline
 from ofsat_ros.report.findings import Findings, Track, read_findings
 from ofsat_ros.report.looks import CutOuts, Gallery, Sky, View
-from ofsat_ros.results import ResultError
+from ofsat_ros.results import ResultError, write_whole
 
 REPORT = "report.html"
 _TEMPLATES = Path(__file__).with_name("page")
@@ -109,13 +108,8 @@ def write_report(
         unlisted=max(len(findings.tracks) - _ROWS, 0),
         **_charts(findings),
     )
-    path, unfinished = folder / REPORT, folder / f".{REPORT}.part"
-    try:
-        # A file's name need not be Unicode.
-        unfinished.write_text(page, encoding="utf-8", errors="replace")
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    path = folder / REPORT
+    write_whole(path, page, "replace")  # a file's name need not be Unicode
     return path
 
 

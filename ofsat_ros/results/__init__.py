@@ -5,7 +5,7 @@ a result reads the same whoever made it: CSV files (tables.py), messages (messag
 them (bag.py), and ``run.json``, which says how they were made (run.py).
 """
 
-from ofsat_ros.results.run import RUN, ResultError, read_run, write_run
+from ofsat_ros.results.run import RUN, ResultError, read_run, write_run, write_whole
 from ofsat_ros.results.tables import (
     DETECTION_COLUMNS,
     DETECTIONS,
@@ -32,4 +32,5 @@ __all__ = [
     "in_words",
     "read_run",
     "write_run",
+    "write_whole",
 ]

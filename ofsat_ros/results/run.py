@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -61,15 +62,45 @@ def write_run(folder: str | Path, run: Mapping[str, Any]) -> None:
     OSError
         If it cannot be written.
     """
-    path = Path(folder) / RUN
-    unfinished = path.with_name(f".{RUN}.part")
+    text = json.dumps(dict(run), indent=2, ensure_ascii=False, allow_nan=False)
+    # Names that are no Unicode become JSON's own escapes.
+    write_whole(Path(folder) / RUN, text + "\n", "backslashreplace")
+
+
+def write_whole(path: Path, text: str, errors: str = "strict") -> None:
+    """Write a file that is whole or, whatever happens meanwhile, as it was before.
+
+    Parameters
+    ----------
+    path : Path
+    text : str
+        Becomes UTF-8.
+    errors : str
+        What becomes of characters that have none, as in `str.encode`.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; it names the file.
+    """
+    unfinished = path.with_name(f".{path.name}.part")
     try:
-        text = json.dumps(dict(run), indent=2, ensure_ascii=False, allow_nan=False)
-        # Names that are no Unicode become JSON's own escapes.
-        unfinished.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
-        os.replace(unfinished, path)
+        with naming(path):
+            unfinished.write_text(text, encoding="utf-8", errors=errors)
+            os.replace(unfinished, path)
     finally:
-        unfinished.unlink(missing_ok=True)
+        with suppress(OSError):  # the folder may be gone
+            unfinished.unlink()
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Have an error of the system name a file, which one of writing doesn't."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = f"{path}"
+        raise
 
 
 def read_run(folder: str | Path) -> dict[str, Any]:

@@ -6,8 +6,9 @@ Times are int ns UTC, angles in deg, unknown is ``nan``.
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Self, TextIO
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from ofsat_ros.detection import CONFIRMED
 from ofsat_ros.pipeline import FrameResult
+from ofsat_ros.results.run import naming
 
 DETECTIONS, TRACKS, STAR_FIELD = "detections.csv", "tracks.csv", "star_field.csv"
 
@@ -59,6 +61,8 @@ TRACK_COLUMNS = (
     "flux",
     "length_px",
 )
+# Of a track's detections: what its line has the mean of, and what the median.
+_AVERAGED, _MEDIANS = ("vx", "vy", "rel_vx", "rel_vy"), ("snr", "flux", "length")
 STAR_FIELD_COLUMNS = (
     "stamp_ns",
     "frame",
@@ -144,6 +148,7 @@ class ResultWriter:
     """
 
     def __init__(self, folder: Path) -> None:
+        self._folder = folder
         self._tracks: dict[int, _TrackSummary] = {}
         with ExitStack() as files:
             self._detections = files.enter_context(_start(folder / DETECTIONS, DETECTION_COLUMNS))
@@ -154,21 +159,23 @@ class ResultWriter:
     def add_detections(self, stamp_ns: int, frame: int, detections: NDArray[np.void]) -> None:
         """Write the detections (DETECTION_DTYPE) of one frame; frames come in their order."""
         # One write: Ctrl-C leaves no part of a line.
-        self._detections.write("".join(detection_lines(stamp_ns, frame, detections)))
+        _write(self._detections, "".join(detection_lines(stamp_ns, frame, detections)))
         for row in detections[detections["track_id"] > 0]:
             track = self._tracks.setdefault(int(row["track_id"]), _TrackSummary())
             track.add(stamp_ns, frame, row)
 
     def add_star_field(self, result: FrameResult) -> None:
         """Write the star field's motion in one frame."""
-        self._star_field.write(_star_field_line(result))
+        _write(self._star_field, _star_field_line(result))
 
     def close(self) -> None:
         """Write the tracks and close the files."""
-        if not self._track_file.closed:
-            lines = [track.line(number) for number, track in sorted(self._tracks.items())]
+        if self._track_file.closed:
+            return
+        lines = [track.line(number) for number, track in sorted(self._tracks.items())]
+        # All files are closed, and so fail again, where one could not be written.
+        with naming(self._folder), self._files:
             self._track_file.write("".join(lines))
-        self._files.close()
 
     def __enter__(self) -> Self:
         return self
@@ -183,24 +190,28 @@ class ResultWriter:
 
 
 class _TrackSummary:
-    """One track's detections, summed up."""
+    """One track's detections, summed up.
+
+    A night's recording has a million of them, so of each a few numbers are kept, and no row.
+    """
 
     def __init__(self) -> None:
-        self._frames: list[tuple[int, int]] = []
-        self._rows: list[np.void] = []
+        self._ends: list[tuple[int, int, float, float]] = []  # stamp, frame, x, y: first and last
+        self._numbers = array("d")
 
     def add(self, stamp_ns: int, frame: int, row: np.void) -> None:
-        self._frames.append((stamp_ns, frame))
-        self._rows.append(row)
+        self._ends[1:] = [(stamp_ns, frame, float(row["x"]), float(row["y"]))]
+        self._numbers.extend(float(row[name]) for name in (*_AVERAGED, *_MEDIANS))
 
     def line(self, track_id: int) -> str:
         """Its line of ``tracks.csv``: mean velocities, median brightness and length."""
-        rows = np.array(self._rows, self._rows[0].dtype)
-        (first_stamp, first), (last_stamp, last) = self._frames[0], self._frames[-1]
-        numbers = [rows[name][i] for i in (0, -1) for name in ("x", "y")]
-        numbers += [float(rows[name].mean()) for name in ("vx", "vy", "rel_vx", "rel_vy")]
-        numbers += [float(np.median(rows[name])) for name in ("snr", "flux", "length")]
-        return _line([track_id, first_stamp, last_stamp, first, last, len(rows)], numbers)
+        first, last = self._ends[0], self._ends[-1]
+        columns = np.array(self._numbers).reshape(-1, len(_AVERAGED) + len(_MEDIANS)).T.copy()
+        means, others = np.split(columns, [len(_AVERAGED)])
+        numbers = [*first[2:], *last[2:]]
+        numbers += [float(each.mean()) for each in means]
+        numbers += [float(np.median(each)) for each in others]
+        return _line([track_id, first[0], last[0], first[1], last[1], columns.shape[1]], numbers)
 
 
 def _star_field_line(result: FrameResult) -> str:
@@ -224,8 +235,18 @@ def _star_field_line(result: FrameResult) -> str:
 def _start(path: Path, columns: tuple[str, ...]) -> TextIO:
     # Line-buffered: each line is on disk once it is written.
     file = path.open("w", 1, encoding="utf-8", newline="\n")
-    file.write(",".join(columns) + "\n")
+    try:
+        _write(file, ",".join(columns) + "\n")
+    except BaseException:
+        with suppress(OSError):  # it says the same again
+            file.close()
+        raise
     return file
+
+
+def _write(file: TextIO, text: str) -> None:
+    with naming(Path(file.name)):
+        file.write(text)
 
 
 def _line(whole: list[int], numbers: list[float], tail: str = "") -> str:

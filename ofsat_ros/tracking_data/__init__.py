@@ -10,6 +10,20 @@ So the formats, which are small, are written here with the standard library.
 """
 
 from ofsat_ros.tracking_data.arcs import ARC_DTYPE, Arc
-from ofsat_ros.tracking_data.files import SUFFIXES, TRACKING_DATA, TrackArcs, write_arcs
+from ofsat_ros.tracking_data.files import (
+    SUFFIXES,
+    TRACKING_DATA,
+    TrackArcs,
+    remove_parts,
+    write_arcs,
+)
 
-__all__ = ["ARC_DTYPE", "SUFFIXES", "TRACKING_DATA", "Arc", "TrackArcs", "write_arcs"]
+__all__ = [
+    "ARC_DTYPE",
+    "SUFFIXES",
+    "TRACKING_DATA",
+    "Arc",
+    "TrackArcs",
+    "remove_parts",
+    "write_arcs",
+]

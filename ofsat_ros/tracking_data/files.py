@@ -18,6 +18,7 @@ from ofsat_ros.tracking_data.tdm import tdm_kvn, tdm_xml
 
 # How the files of a format end, and the name of a recording's.
 SUFFIXES = {"kvn": ".tdm", "xml": ".xml", "iod": ".iod"}
+_ABANDONED_S = 60.0  # a file is written in some ms
 TRACKING_DATA = {name: f"tracks{suffix}" for name, suffix in SUFFIXES.items()}
 
 
@@ -148,6 +149,21 @@ def write_arcs(
         message = {"kvn": tdm_kvn, "xml": tdm_xml}[format]
         text = message(arcs, parameters, time.time_ns())
     _write_whole(path, text, force)
+
+
+def remove_parts(folder: Path) -> None:
+    """Remove what writers that were killed have left half-written in a folder.
+
+    Raises
+    ------
+    OSError
+        If it cannot be removed.
+    """
+    for suffix in SUFFIXES.values():
+        for part in folder.glob(f".*{suffix}.{'[0-9a-f]' * 8}.part"):
+            # A younger one may be another writer's that is at work.
+            if time.time() - part.stat().st_mtime > _ABANDONED_S:
+                part.unlink(missing_ok=True)
 
 
 def _write_whole(path: Path, text: str, force: bool) -> None:

@@ -11,13 +11,15 @@ from typing import Any, BinaryIO, Self
 
 import numpy as np
 
-from ofsat_ros.images import decode_image, luminance
+from ofsat_ros.images import check_size, decode_image, luminance
 from ofsat_ros.recordings.bag import RecordingError
 from ofsat_ros.recordings.fits.warning import silence
 
 _BAYER = ("RGGB", "BGGR", "GBRG", "GRBG")
 _MOST_PLANES = 1_000_000
 _GZIP = b"\x1f\x8b"
+# What is unpacked is held in memory.
+_MOST_BYTES = 2 << 30
 
 
 class Cards(Mapping[str, Any]):
@@ -95,6 +97,7 @@ class Picture:
     def pixels(self, plane: int) -> np.ndarray:
         """Return an image as it lies in the file: (height, width) or (3, height, width)."""
         shape = self._hdu.shape
+        check_size(shape[-1], shape[-2])
         leading: list[Any] = list(np.unravel_index(plane, shape[:-2])) if len(shape) > 2 else []
         if self.is_colour:
             leading = [slice(None) if length == 3 else 0 for length in shape[:-2]]
@@ -219,11 +222,13 @@ def _unzipped(path: Path) -> BinaryIO:
             return path.open("rb")
         file.seek(0)
         content, decompress = io.BytesIO(), zlib.decompressobj(31)
-        while block := file.read(1 << 20):
+        while block := file.read(1 << 16):
             try:
                 content.write(decompress.decompress(block))
             except zlib.error:
                 break
+            if content.tell() > _MOST_BYTES:
+                raise ValueError(f"it unpacks to more than {_MOST_BYTES >> 30} GiB: gunzip it")
     return content
 
 
