@@ -23,7 +23,7 @@ ROS = [
     "ros-jazzy-visualization-msgs",
     *OPENCV,
 ]
-LINT = ["mypy>=2.4,<3", "ruff>=0.17,<0.18", "types-PyYAML", "types-tqdm"]
+LINT = ["mypy>=2.4,<3", "pip-audit", "ruff>=0.17,<0.18", "types-PyYAML", "types-tqdm"]
 SKY = ["astropy>=5.3"]  # the first that reads parts of compressed images
 PLOT = ["matplotlib"]
 REPORT = ["av", "jinja2", "pillow"]
@@ -86,7 +86,7 @@ setup(
     entry_points={
         "console_scripts": [
             f"ofsat = {NAME}.cli:main",
-            *(f"{node} = {NAME}.nodes.{node}:main" for node in NODES),
+            *(f"{node} = {NAME}.nodes.start:{node}" for node in NODES),
         ]
     },
 )

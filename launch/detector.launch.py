@@ -4,6 +4,7 @@ For example::
 
     ros2 launch ofsat_ros detector.launch.py image:=/camera/image_raw params_file:=my.yaml
     ros2 launch ofsat_ros detector.launch.py image:=/camera/image_raw rviz:=true
+    ros2 launch ofsat_ros detector.launch.py image:=/camera/image_raw respawn:=true
 
 Sets the Fast DDS profile for large images unless the environment already names one; whoever sends
 the images needs it too.
@@ -58,6 +59,12 @@ ARGUMENTS = [
         "params_file", default_value="", description="YAML file of parameters; empty: none"
     ),
     DeclareLaunchArgument(
+        "respawn",
+        default_value="false",
+        choices=["true", "false"],
+        description="true: start the node again, 2 s after it ended in whatever way",
+    ),
+    DeclareLaunchArgument(
         "rviz",
         default_value="false",
         choices=["true", "false"],
@@ -89,6 +96,8 @@ def detector(context: LaunchContext) -> list[Node]:
             name="detector",
             namespace=given["namespace"],
             output="screen",
+            respawn=given["respawn"] == "true",
+            respawn_delay=2.0,
             parameters=[*files, parameters],
             remappings=remappings,
         ),

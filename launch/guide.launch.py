@@ -38,6 +38,12 @@ ARGUMENTS = [
         description="true: command the mount from the start; empty: as the parameters say",
     ),
     DeclareLaunchArgument(
+        "respawn",
+        default_value="false",
+        choices=["true", "false"],
+        description="true: start the node again, 2 s after it ended in whatever way",
+    ),
+    DeclareLaunchArgument(
         "params_file", default_value="", description="YAML file of parameters; empty: none"
     ),
 ]
@@ -61,6 +67,8 @@ def guide(context: LaunchContext) -> list[Node]:
             name="guide",
             namespace=given["namespace"],
             output="screen",
+            respawn=given["respawn"] == "true",
+            respawn_delay=2.0,
             parameters=[*([given["params_file"]] if given["params_file"] else []), parameters],
             remappings=[
                 (name, given[name]) for name in ("camera_info", "mount_rate") if given[name]

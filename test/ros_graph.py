@@ -26,6 +26,8 @@ from ofsat_ros.simulation import SimulatedFrame, scenario
 
 # Discovery takes up to a second on a busy machine; what hangs shall not hang the tests.
 PATIENCE_S = 20.0
+# Several processes import numpy, OpenCV and ROS at once, beside other work.
+START_S = 60.0
 
 
 class Graph:
@@ -105,7 +107,7 @@ class Process:
         self._out, self._err = (folder / f"{node}.{end}" for end in ("out", "err"))
         with self._out.open("w") as out, self._err.open("w") as err:
             self.popen = subprocess.Popen(
-                [sys.executable, "-m", f"ofsat_ros.nodes.{node}", *arguments],
+                [sys.executable, "-m", "ofsat_ros.nodes.start", node, *arguments],
                 stdout=out,
                 stderr=err,
                 env={**os.environ, **environment},
@@ -160,7 +162,7 @@ class Process:
         """Return the exit code."""
         return self.popen.wait(patience_s)
 
-    def wait_for(self, text: str, patience_s: float = PATIENCE_S) -> None:
+    def wait_for(self, text: str, patience_s: float = START_S) -> None:
         """Wait until it has said something."""
         deadline_s = time.monotonic() + patience_s
         while text not in self.out + self.err:

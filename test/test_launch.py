@@ -90,6 +90,14 @@ def test_detector_is_left_as_it_is_without_arguments(launch: Any):
     assert node.kwargs["remappings"] == []
 
 
+@pytest.mark.parametrize("name", ["detector", "guide"])
+def test_what_dies_in_the_night_is_started_again_if_so_wanted(name: str, launch: Any):
+    for wanted in (True, False):
+        node = only("Node", launch(f"{name}.launch.py", respawn=str(wanted).lower()))
+        # With the delay, what cannot start does not keep a processor busy.
+        assert (node.kwargs["respawn"], node.kwargs["respawn_delay"]) == (wanted, 2.0)
+
+
 def test_detector_takes_its_arguments(launch: Any):
     node = only(
         "Node",

@@ -230,7 +230,7 @@ def test_a_frame_without_stamp_is_answered_and_named():
         station = Station(graph)
         station.send(*unstamped)
         status = station.diagnostics_when(lambda s: "no stamp" in s.message)
-    assert status.level == DiagnosticStatus.WARN
+    assert status.level == DiagnosticStatus.ERROR
     assert stamps(station.clouds) == [0, 0]
 
 
@@ -561,7 +561,7 @@ def test_no_image_is_said_and_forgotten_when_one_comes():
     with Graph(*RELIABLE, "-p", "no_image_timeout_s:=0.5") as graph:
         station = Station(graph)
         status = station.diagnostics_when(lambda s: "no image on /image for" in s.message)
-        assert status.level == DiagnosticStatus.WARN
+        assert status.level == DiagnosticStatus.ERROR
         graph.probe.destroy_publisher(station.camera)
         station.diagnostics_when(lambda s: "nobody publishes it" in s.message)
 
@@ -610,7 +610,7 @@ def test_incompatible_qos_is_said_with_the_remedy():
         graph.publisher(Image, "image", best_effort=True)
         graph.until(lambda: heard and "reliable_input:=false" in heard[-1].status[0].message)
         assert detector.count_publishers("/image") == 1
-    assert heard[-1].status[0].level == DiagnosticStatus.WARN
+    assert heard[-1].status[0].level == DiagnosticStatus.ERROR
 
 
 def test_qos_can_be_overridden():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ofsat_ros.detection import CANDIDATE, CONFIRMED, DETECTION_DTYPE
-from ofsat_ros.nodes.health import Health
+from ofsat_ros.nodes.health import Around, Health
 from ofsat_ros.objects import OBJECT_DTYPE
 from ofsat_ros.pipeline import FrameResult
 from ofsat_ros.star_field import StarFieldMotion
@@ -28,8 +28,15 @@ def health(reliable: bool = False) -> Health:
     return Health("/camera/image", reliable, PROFILE)
 
 
-def problems(one: Health, publishers: int = 1) -> list[str]:
-    return one.problems(publishers, timeout_s=5.0)
+def problems(one: Health, publishers: int = 1, **around) -> list[str]:
+    """All of them, errors first."""
+    one.around = Around(publishers, **around)
+    errors, warnings = one.problems(timeout_s=5.0)
+    return errors + warnings
+
+
+def errors(one: Health, in_work_s: float = 0.0) -> list[str]:
+    return one.problems(5.0, in_work_s)[0]
 
 
 def test_nothing_is_wrong_at_the_start(clock):
@@ -44,15 +51,18 @@ def test_silence_names_the_topic_and_what_to_do(clock):
     assert "no image on /camera/image for 6 s: nobody publishes it; remap" in nobody
     (somebody,) = problems(one, publishers=1)
     assert f"FASTRTPS_DEFAULT_PROFILES_FILE={PROFILE}" in somebody
-    (typo,) = one.problems(0, 5.0, ["/camera/image_raw"])
+    (typo,) = problems(one, publishers=0, elsewhere=["/camera/image_raw"])
     assert typo.endswith("images are on /camera/image_raw")
     one.image_received(1, has_stamp=True)
     assert problems(one) == []
     clock[0] += 7
-    (ended,) = problems(one, publishers=1)
-    assert ended == (
-        "no image on /camera/image for 7 s: 1 came before; the sender has paused or ended"
+    (paused,) = problems(one, publishers=1)
+    assert paused == (
+        "no image on /camera/image for 7 s: 1 came before; the sender has paused or hangs: see to"
+        " the camera and its driver"
     )
+    (ended,) = problems(one, publishers=0)
+    assert "nobody publishes it any more: start the camera's driver again" in ended
 
 
 def test_lost_frames_are_counted_from_the_senders_numbers(clock):
@@ -90,10 +100,45 @@ def test_a_failure_is_said_until_a_frame_succeeds(clock):
     one.image_received(1, has_stamp=True)
     one.failed("the image is too short")
     assert "the image is too short" in problems(one)[0]
-    one.processed(FrameResult(0, 0, (10, 10), reason="no object"), latency_s=0.1, seconds={})
+    one.processed(frame(), latency_s=0.1, seconds={})
     assert problems(one) == []
-    assert one.summary() == "no object"
     assert one.values()["frames_failed"] == one.values()["frames_processed"] == 1
+
+
+def test_a_torn_frame_is_a_warning_and_three_in_a_row_are_an_error(clock):
+    one = health()
+    for failures in range(1, 5):
+        one.image_received(failures, has_stamp=True)
+        one.failed("the image is too short")
+        assert len(problems(one)) == 1
+        assert bool(errors(one)) == (failures >= 3)
+    one.processed(frame(), latency_s=0.1, seconds={})
+    one.failed("the image is too short")
+    assert errors(one) == []
+
+
+def test_a_frame_without_an_object_is_said(clock):
+    one = health()
+    none = np.zeros(0, OBJECT_DTYPE)
+    one.processed(frame(objects=none, reason="no object"), latency_s=0.1, seconds={})
+    assert problems(one) == ["nothing is seen: no object"]
+    assert errors(one) == []
+
+
+def test_a_frame_that_does_not_end_is_an_error_and_no_silence(clock):
+    one = health()
+    one.image_received(1, has_stamp=True)
+    assert errors(one, in_work_s=4.9) == []
+    clock[0] += 12
+    (said,) = errors(one, in_work_s=12.0)
+    assert said.startswith("the frame in work takes 12 s so far: if it does not end, restart")
+
+
+def test_rivals_are_named(clock):
+    assert (
+        "/detector, /old publishes detections on the same topic"
+        in (problems(health(), rivals=["/detector", "/old"])[0])
+    )
 
 
 def rows(dtype: np.dtype, *statuses: int) -> np.ndarray:
@@ -224,7 +269,7 @@ def test_it_may_be_read_while_frames_are_answered():
         # Without a lock about one in five raises: the frames change while the rate is computed.
         for _ in range(3000):
             assert one.values()["frames_processed"] >= 0
-            one.problems(publishers=1, timeout_s=5.0)
+            one.problems(timeout_s=5.0)
     finally:
         ended.set()
         worker.join()
@@ -233,7 +278,7 @@ def test_it_may_be_read_while_frames_are_answered():
 
 def test_unknown_directions_are_a_problem_only_if_they_were_known(clock):
     one = health()
-    one.processed(FrameResult(0, 0, (10, 10)), 0.1, {"process": 0.1})
+    one.processed(frame(), 0.1, {"process": 0.1})
     one.directions = ("no attitude has come", False)
     assert problems(one) == []
     assert one.values()["directions"] == "no attitude has come"

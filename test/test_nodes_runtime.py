@@ -13,6 +13,7 @@ from ros_graph import Process, sky, write_bag
 
 from ofsat_ros.nodes import runtime
 from ofsat_ros.nodes.runtime import Inbox
+from ofsat_ros.nodes.start import END_SIGNALS
 
 MEGABYTE = 1 << 20
 
@@ -127,6 +128,8 @@ def test_signals_end_every_node_within_a_second(number, tmp_path):
         "simulator": ("--ros-args", "-p", "rate:=20.0"),
         "player": (f"{bag}",),
         "recorder": ("--ros-args", "-p", f"output:={tmp_path / 'output'}"),
+        "guide": ("--ros-args", "-p", "engaged:=true"),
+        "tdm_writer": ("--ros-args", "-p", f"output:={tmp_path / 'tracks'}"),
     }
     with ExitStack() as stack:
         nodes = {
@@ -138,6 +141,8 @@ def test_signals_end_every_node_within_a_second(number, tmp_path):
         nodes["player"].wait_for("waiting for 1 subscriber")
         nodes["recorder"].wait_for("hearing a detector")
         nodes["recorder"].wait_for("no RSO")
+        nodes["guide"].wait_for("waiting for tracks on")
+        nodes["tdm_writer"].wait_for("writing the tracks of")
         # Other processes on this machine make and remove segments meanwhile.
         segments = set.union(*(node.shared_memory for node in nodes.values()))
         assert len(segments) >= len(nodes)
@@ -154,7 +159,7 @@ def test_signals_end_every_node_within_a_second(number, tmp_path):
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable]:
     """Return a function that runs a node's main here, without the imports of a new process."""
     monkeypatch.setattr(runtime, "prepare_for_large_images", lambda: None)
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.getsignal(number) for number in END_SIGNALS}
 
     def main(node: str, *arguments: str) -> int:
         monkeypatch.setattr("sys.argv", [node, *arguments])

@@ -349,7 +349,7 @@ def test_on_a_real_terminal_it_ends_clean(how: str):
 
 def test_without_a_terminal_it_says_what_else_there_is():
     done = subprocess.run(
-        [sys.executable, "-m", "ofsat_ros.nodes.watch"],
+        [sys.executable, "-m", "ofsat_ros.nodes.start", "watch"],
         capture_output=True,
         text=True,
         timeout=PATIENCE_S,

@@ -15,6 +15,7 @@ from datetime import UTC, datetime
 import click
 import numpy as np
 
+from ofsat_ros.printing import printable
 from ofsat_ros.tracking import COASTING
 
 # Tracks that have ended; older ones are forgotten.
@@ -24,7 +25,7 @@ _SILENCE_S = 3.0
 # Without a new frame for so many times that of the last ones, what is shown is of the past.
 _INTERVALS = 4
 # What comes after the node in the name of a status of ours, besides the detector's own.
-_DETECTION, _BESIDE = "detection", ("guidance", "tracking data")
+_DETECTION, _BESIDE = "detection", ("guidance", "tracking data", "recording")
 
 
 @dataclass
@@ -83,11 +84,15 @@ class Board:
 
     def status(self, name: str, warns: bool, message: str, values: Mapping[str, str]) -> None:
         """Take note of what a node says of itself in ``/diagnostics``."""
-        self._statuses[name] = _Status(warns, message, values, time.monotonic())
+        values = {printable(key): printable(value) for key, value in values.items()}
+        self._statuses[printable(name)] = _Status(
+            warns, printable(message), values, time.monotonic()
+        )
 
     def publishers(self, nodes: Sequence[str], elsewhere: Sequence[str]) -> None:
         """Take note of which nodes publish the tracks, and of other topics with tracks."""
-        self._publishers, self._elsewhere = nodes, elsewhere
+        self._publishers = [printable(node) for node in nodes]
+        self._elsewhere = [printable(topic) for topic in elsewhere]
 
     def lines(self, width: int, height: int) -> list[str]:
         """Return what there is to see, in lines that fit the terminal, with its colours."""

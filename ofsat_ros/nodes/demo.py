@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import csv
 import os
-import signal
 import subprocess
 import sys
 import threading
@@ -18,8 +17,9 @@ from collections import Counter
 from pathlib import Path
 
 import ofsat_ros
-from ofsat_ros.nodes.processes import children
+from ofsat_ros.nodes.processes import children, stop_on_signals
 from ofsat_ros.nodes.recorder import BAG, HEARING
+from ofsat_ros.nodes.start import STOPPED
 from ofsat_ros.recordings import COMPRESSED_IMAGE, Bag, RecordingError, open_recording
 from ofsat_ros.results import DETECTIONS, in_words
 
@@ -35,7 +35,7 @@ class DemoError(Exception):
 def main() -> int:
     """Run the demo; return 0 if every frame was answered, 1 if not, 2 if it could not start."""
     options = _options()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    stop_on_signals()
     try:
         return _run(options)
     except (DemoError, RecordingError) as error:
@@ -43,7 +43,7 @@ def main() -> int:
         return 2
     except KeyboardInterrupt:
         sys.stderr.write("demo: stopped\n")
-        return 130
+        return STOPPED
 
 
 def _options() -> argparse.Namespace:

@@ -11,7 +11,6 @@ import argparse
 import csv
 import math
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -31,8 +30,9 @@ from sensor_msgs.msg import CameraInfo, PointCloud2
 
 from ofsat_ros.camera import Camera
 from ofsat_ros.nodes import messages
-from ofsat_ros.nodes.processes import children, own_graph
+from ofsat_ros.nodes.processes import children, own_graph, stop_on_signals
 from ofsat_ros.nodes.runtime import prepare_for_large_images, reliable
+from ofsat_ros.nodes.start import STOPPED
 
 SCENARIOS = ("guide_drift", "guide_leo")
 COLUMNS = ("stamp_ns", "time_s", "right_px", "down_px", "told_right_px", "told_down_px", "state")
@@ -55,9 +55,9 @@ class DemoError(Exception):
 def main() -> int:
     """Run the demo; return 0 if the RSO was held, 1 if not, 2 if it could not be run."""
     options = _options()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    stop_on_signals()
     # The looker-on is in the same graph as the nodes.
-    os.environ.update({name: os.environ.get(name, own) for name, own in own_graph().items()})
+    os.environ.update(own_graph())
     prepare_for_large_images()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
@@ -67,7 +67,7 @@ def main() -> int:
         return 2
     except KeyboardInterrupt:
         sys.stderr.write("demo_guide: stopped\n")
-        return 130
+        return STOPPED
     finally:
         rclpy.try_shutdown()
 

@@ -14,9 +14,7 @@ import time
 import traceback
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
-from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
@@ -29,8 +27,10 @@ from visualization_msgs.msg import MarkerArray
 from ofsat_ros.detection import DETECTION_DTYPE
 from ofsat_ros.images import EncodingError, decode_message
 from ofsat_ros.nodes import messages
+from ofsat_ros.nodes.causes import Causes
+from ofsat_ros.nodes.diagnostics import Diagnostics, Heartbeat
 from ofsat_ros.nodes.drawing import Drawing
-from ofsat_ros.nodes.health import Health, timed
+from ofsat_ros.nodes.health import Around, Health, stuck_words, timed
 from ofsat_ros.nodes.ros_parameters import NodeParameters, start_value
 from ofsat_ros.nodes.runtime import (
     Inbox,
@@ -48,13 +48,15 @@ from ofsat_ros.parameters import (
     Parameters,
     Table,
 )
-from ofsat_ros.pipeline import ImageError, Pipeline
+from ofsat_ros.pipeline import FrameResult, ImageError, Pipeline
 from ofsat_ros.tracking import TRACK_DTYPE
 
 # Results are small; a subscriber may be this far behind and lose none.
 _RESULTS_DEPTH = 100
 _PICTURES_DEPTH = 20
 _WARN_EVERY_S = 10.0
+# A longer name of a frame is none, and would go out again in each marker.
+_LONGEST_FRAME_ID = 255
 
 
 class Detector(Node):
@@ -85,29 +87,27 @@ class Detector(Node):
         self._pipeline = Pipeline(self._settings[Parameters])
         self._sky = Sky(self, self._settings[CameraParameters], own.reliable_input)
         self._reset_wanted = ""
+        self._causes = Causes()  # of frames in which nothing is found
         backlog_s = None if own.reliable_input else own.backlog_s
         self._inbox = Inbox(own.queue_depth, backlog_s)
         self._create_publishers()
         self._images = self._subscribe(own)
-        self._image_publishers = 0
-        self._elsewhere: list[str] = []  # other topics with images, if nobody publishes ours
         self._health = Health(self._images.topic_name, own.reliable_input, profile_path())
-        self._said_silence = False
+        self._said: set[str] = set()  # kinds of problems that are logged already
         self._drawing = Drawing(
             self, self._markers, self._annotated, own.reliable_input, self._health
         )
         self._callbacks_s: float | None = None  # CPU time of their thread at the end of the last
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/enable", self._on_enable)
-        # Steady: diagnostics go on when a player's clock stands still.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(1.0, self._tick, clock=steady)
         self._worker = threading.Thread(target=self._work, name="detector", daemon=True)
         self._worker.start()
+        self._heartbeat = Heartbeat(self, self._tick)
         self.get_logger().info(f"waiting for images on {self._images.topic_name}")
 
     def close(self) -> None:
         """End the worker; a frame in work may still be answered."""
+        self._heartbeat.close()
         self._inbox.close()
         self._drawing.close()
         self._worker.join(0.5)
@@ -124,7 +124,7 @@ class Detector(Node):
         self._markers = publisher(MarkerArray, "flow_markers", _RESULTS_DEPTH)
         self._motion = publisher(Vector3Stamped, "star_field_motion", _RESULTS_DEPTH)
         self._annotated = publisher(Image, "image_annotated", _PICTURES_DEPTH)
-        self._diagnostics = publisher(DiagnosticArray, "/diagnostics", _RESULTS_DEPTH)
+        self._diagnostics = Diagnostics(self, "detection")
 
     def _subscribe(self, own: DetectorParameters):
         compressed = own.image_transport == "compressed"
@@ -148,7 +148,8 @@ class Detector(Node):
     def _on_image(self, message: Image | CompressedImage, info: dict) -> None:
         received_s = time.monotonic()
         # Each sender counts for itself, so numbers tell of losses only while there is one.
-        sequence = info["publication_sequence_number"] if self._image_publishers == 1 else None
+        alone = self._health.around.publishers == 1
+        sequence = info["publication_sequence_number"] if alone else None
         stamp_ns = messages.stamp_ns(message.header.stamp)
         self._health.image_received(sequence, has_stamp=stamp_ns != 0)
         seconds = {"receive": self._callback_cpu_s()}
@@ -187,26 +188,29 @@ class Detector(Node):
             try:
                 self._answer(*item)
                 # Each frame's own numbers; those of the timer go on when no image comes.
-                if self._diagnostics.get_subscription_count():
+                if self._diagnostics.heard():
                     self._publish_diagnostics()
             # Nothing that is drawn or sent may end the thread, and with it all answers.
             except Exception:  # noqa: BLE001
                 if self._inbox.closed:
                     return
-                self.get_logger().error(traceback.format_exc())
+                self.get_logger().error(
+                    traceback.format_exc(), throttle_duration_sec=_WARN_EVERY_S
+                )
 
     def _answer(
         self, message: Image | CompressedImage, received_s: float, seconds: dict[str, float]
     ) -> None:
         """Answer an image; `seconds` takes what each step of it needs."""
         seconds["wait"] = time.monotonic() - received_s
-        if self._reset_wanted:
-            self._pipeline.reset(self._reset_wanted)
-            self._reset_wanted = ""
-        header = message.header
+        header, own = message.header, self._settings[DetectorParameters]
         try:
+            if self._reset_wanted:
+                reason, self._reset_wanted = self._reset_wanted, ""
+                self._pipeline.reset(reason)
+            _check_header(header)
             with timed(seconds, "convert"):
-                image = decode_message(message)
+                image = decode_message(message, own.max_pixels)
             with timed(seconds, "process"):
                 middle_ns = self._sky.middle_ns(messages.stamp_ns(header.stamp))
                 result = self._pipeline.process(image, middle_ns)
@@ -218,23 +222,30 @@ class Detector(Node):
             self._fail(header, str(error))
         # Whatever an image does to the stages, it must not take the node down.
         except Exception as error:  # noqa: BLE001
-            self.get_logger().error(traceback.format_exc())
-            self._fail(header, f"{type(error).__name__}: {error}")
-            self._pipeline.reset("an error in the frame before")
+            self._reset_wanted = "an error in the frame before"
+            self._fail(header, f"{type(error).__name__}: {error}", traceback.format_exc())
         else:
             with timed(seconds, "publish"):
                 self._publish_clouds(header, result.detections, result.tracks)
                 self._motion.publish(messages.star_field_vector(header, result))
             self._health.processed(result, time.monotonic() - received_s, seconds | result.seconds)
-            scale = self._settings[DetectorParameters].marker_scale
-            self._drawing.show(header, image, result, scale)
+            self._say_what_is_seen(result)
+            self._drawing.show(header, image, result, own.marker_scale)
 
-    def _fail(self, header: Header, why: str) -> None:
+    def _say_what_is_seen(self, result: FrameResult) -> None:
+        """Log that images show nothing, and when they show something again."""
+        if not len(result.objects):
+            if self._causes.wrong(result.reason):
+                self.get_logger().warning(f"nothing is seen: {result.reason}")
+        elif count := self._causes.right():
+            frames = "1 frame" if count == 1 else f"{count} frames"
+            self.get_logger().info(f"objects are found again, after {frames} without")
+
+    def _fail(self, header: Header, why: str, details: str = "") -> None:
         """Answer an image that could not be processed: nothing found, and nothing stale left."""
         self._health.failed(why)
-        self.get_logger().warning(
-            f"image not processed: {why}", throttle_duration_sec=_WARN_EVERY_S
-        )
+        if self._causes.wrong(why):
+            self.get_logger().warning(f"image not processed: {details or why}")
         self._publish_clouds(header, np.zeros(0, DETECTION_DTYPE), np.zeros(0, TRACK_DTYPE))
         self._motion.publish(messages.star_field_vector(header, None))
         self._drawing.clear(header)
@@ -245,14 +256,11 @@ class Detector(Node):
 
     def _tick(self) -> None:
         """Do once a second what does not depend on images."""
-        try:
-            self._clear_stale_markers()
-            self._look_around()
-            self._publish_diagnostics()
-        # To say how it is must not end what works.
-        except Exception:  # noqa: BLE001
-            self.get_logger().error(traceback.format_exc(), throttle_duration_sec=_WARN_EVERY_S)
-        self._callbacks_s = time.thread_time()
+        self._clear_stale_markers()
+        self._health.around = self._look_around()
+        self._sky.look_around()
+        self._say_aloud()
+        self._publish_diagnostics()
 
     def _clear_stale_markers(self) -> None:
         """Delete what is drawn when images stop."""
@@ -262,23 +270,18 @@ class Detector(Node):
         if not goes_on:
             self._drawing.clear_after(timeout_s)
 
-    def _look_around(self) -> None:
-        self._image_publishers = self.count_publishers(self._images.topic_name)
-        self._elsewhere = [] if self._image_publishers else self._other_image_topics()
-        self._sky.look_around()
-        self._say_aloud()
+    def _look_around(self) -> Around:
+        publishers = self.count_publishers(self._images.topic_name)
+        infos = self.get_publishers_info_by_topic(self._detections.topic_name)
+        nodes = [f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in infos]
+        if (own := self.get_fully_qualified_name()) in nodes:
+            nodes.remove(own)
+        return Around(publishers, [] if publishers else self._other_image_topics(), nodes)
 
     def _publish_diagnostics(self) -> None:
         timeout_s = self._settings[DetectorParameters].no_image_timeout_s
-        status = messages.diagnostic(
-            f"{self.get_fully_qualified_name()}: detection",
-            self._health.problems(self._image_publishers, timeout_s, self._elsewhere),
-            self._health.summary(),
-            self._health.values(),
-        )
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(array)
+        errors, warnings = self._health.problems(timeout_s, self._inbox.in_work_s())
+        self._diagnostics.say(self._health.summary(), self._health.values(), errors, warnings)
 
     def _other_image_topics(self) -> list[str]:
         """Topics with images that somebody else publishes: perhaps the camera's."""
@@ -290,16 +293,32 @@ class Detector(Node):
         ]
 
     def _say_aloud(self) -> None:
-        """Log what a user must know who does not watch ``/diagnostics``."""
+        """Log what a user must know who does not watch ``/diagnostics``, once while it lasts."""
         timeout_s = self._settings[DetectorParameters].no_image_timeout_s
-        silent = self._health.enabled and self._health.silence_s() > timeout_s
-        if silent and not self._said_silence:
-            self.get_logger().warning(
-                self._health.silence(self._image_publishers, self._elsewhere)
-            )
-        self._said_silence = silent
+        stuck = stuck_words(self._inbox.in_work_s(), timeout_s)
+        problems = {
+            "stuck": stuck,
+            "silence": "" if stuck else self._health.silence(timeout_s),
+            "rivals": self._health.rivalry(),
+        }
+        for kind, words in problems.items():
+            if words and kind not in self._said:
+                self.get_logger().warning(words)
+        if "silence" in self._said and self._health.silence_s() <= timeout_s:
+            self.get_logger().info(f"images come again on {self._images.topic_name}")
+        self._said = {kind for kind, words in problems.items() if words}
         if losses := self._health.losses():
             self.get_logger().warning(losses, throttle_duration_sec=_WARN_EVERY_S)
+
+
+def _check_header(header: Header) -> None:
+    """Raise an EncodingError if a header is not to be sent on as it is; it is then."""
+    length = len(header.frame_id)
+    if length > _LONGEST_FRAME_ID:
+        header.frame_id = ""
+        raise EncodingError(
+            f"header.frame_id has {length} characters, more than {_LONGEST_FRAME_ID}"
+        )
 
 
 def main() -> int:

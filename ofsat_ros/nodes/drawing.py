@@ -2,8 +2,9 @@
 
 It stands after the answer, in a thread of its own: nothing is drawn that nobody looks at, and
 what is drawn delays no answer.  A live camera's frames are left out when drawing falls behind or
-would take more than half a core; with reliable input every frame is drawn, and a viewer slows the
-replay down instead.
+would take more than half a core; with reliable input every frame is drawn, and drawing slows the
+replay down instead.  A viewer who does not take his pictures (stopped, or behind a slow line) gets
+fewer, and nobody waits for him.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import numpy as np
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_msgs.msg import Header
@@ -28,6 +30,10 @@ from ofsat_ros.pipeline import FrameResult
 
 # s; the longest rest between two pictures.
 _REST_S = 0.2
+# s; so long what was sent may be on its way to a viewer before he is taken to hang.
+_PATIENCE_S = 1.0
+_POLL_S = 0.01
+_WARN_EVERY_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -69,6 +75,7 @@ class Drawing:
         # One in work and one that waits: more would only take memory.
         self._inbox = Inbox(1, None if every_frame else 0.0, limit_bytes=0)
         self._shown: tuple[Header, float] | None = None  # markers that are to be seen, since when
+        self._received_s = 0.0  # when all pictures sent so far had arrived
         self._tails = report.Tails()
         self._thread = threading.Thread(target=self._work, name="drawing", daemon=True)
         self._thread.start()
@@ -106,7 +113,7 @@ class Drawing:
             except Exception:  # noqa: BLE001
                 if self._inbox.closed:
                     return
-                self._logger.error(traceback.format_exc())
+                self._logger.error(traceback.format_exc(), throttle_duration_sec=_WARN_EVERY_S)
             taken_s = time.perf_counter() - start_s
             if item[1] is not None:
                 self._health.drawn(taken_s)
@@ -122,7 +129,7 @@ class Drawing:
             array = messages.flow_markers(header, scene.result, scene.scale)
             self._markers.publish(array)
             self._shown = (header, time.monotonic())
-        if self._pictures.get_subscription_count():
+        if self._pictures.get_subscription_count() and self._pictures_arrive():
             picture = report.annotate(
                 scene.image,
                 scene.result,
@@ -131,6 +138,26 @@ class Drawing:
                 footer=f"{_utc(header)}  {self._health.pace()}",
             )
             self._pictures.publish(messages.image_message(header, picture))
+
+    def _pictures_arrive(self) -> bool:
+        """Tell whether all viewers have what was sent: to send more holds up this whole process.
+
+        rclpy lets no other thread run while the middleware sends, which takes many times as long
+        for one who takes nothing.
+        """
+        while not self._pictures.wait_for_all_acked(Duration(seconds=0)):
+            behind = time.monotonic() - self._received_s > _PATIENCE_S
+            if behind:
+                self._logger.warning(
+                    f"pictures are left out: a viewer of {self._pictures.topic_name} does not take"
+                    " them; end it, or let it ask for best effort",
+                    throttle_duration_sec=_WARN_EVERY_S,
+                )
+            if behind or not self._every_frame or self._inbox.closed:
+                return False
+            time.sleep(_POLL_S)
+        self._received_s = time.monotonic()
+        return True
 
 
 def _utc(header: Header) -> str:

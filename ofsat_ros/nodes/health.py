@@ -1,7 +1,7 @@
 """What the detector knows of its own state: counts, rates, and what is wrong in words.
 
 The detector tells it what happens; ``/diagnostics`` shows what it makes of it.  It imports no ROS.
-Frames are answered in one thread, and everything else happens in another.
+Images come in one thread, are answered in another, and a third asks how it is.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,8 @@ from ofsat_ros.tracking import COASTING
 _RECENT_S = 10.0
 # More of the newest frames are not needed for a rate.
 _FRAMES_IN_RATE = 200
+# A torn frame or two are none of the node's; so many in a row are.
+_FAILING = 3
 # s; a stage's time is its mean over it, or that of the last frame.
 _PROFILE_S = 1.0
 
@@ -36,6 +39,25 @@ def timed(seconds: dict[str, float], step: str) -> Iterator[None]:
         yield
     finally:
         seconds[step] = time.perf_counter() - start_s
+
+
+@dataclass(frozen=True)
+class Around:
+    """What a detector sees of the graph.
+
+    Attributes
+    ----------
+    publishers : int
+        How many publish the image topic.
+    elsewhere : sequence of str
+        Other topics with images.
+    rivals : sequence of str
+        Other nodes that publish detections where this one does.
+    """
+
+    publishers: int = 0
+    elsewhere: Sequence[str] = ()
+    rivals: Sequence[str] = ()
 
 
 class Health:
@@ -64,11 +86,12 @@ class Health:
         self._latency_s = float("nan")
         self._profile_of: deque[tuple[float, Mapping[str, float]]] = deque(maxlen=_FRAMES_IN_RATE)
         self._drawing_s = float("nan")
-        self._failure = ""
+        self._failure, self._failures = "", 0  # of the last frames, in a row
         self._incompatible = ""
         self._zero_stamp = False
         self._result: FrameResult | None = None
         self.enabled = True
+        self.around = Around()
         # Why directions are unknown, empty if they are known; and whether that is a fault.
         self.directions: tuple[str, bool] = ("no image has come", False)
 
@@ -112,7 +135,7 @@ class Health:
                 self._profile_of.popleft()
             self._latency_s = latency_s
             self._result = result
-            self._failure = ""
+            self._failure, self._failures = "", 0
 
     def drawn(self, seconds: float) -> None:
         """Take note of how long drawing took, s."""
@@ -123,6 +146,7 @@ class Health:
         with self._lock:
             self._counts["failed"] += 1
             self._failure = why
+            self._failures += 1
 
     def incompatible_qos(self, policy: str) -> str:
         """Take note of a publisher that cannot be heard; return what to say about it."""
@@ -143,14 +167,19 @@ class Health:
         """Return the time since the last image, or since the start, s."""
         return time.monotonic() - self._last_image_s
 
-    def silence(self, publishers: int, elsewhere: Sequence[str] = ()) -> str:
-        """Return what to say when no image comes, with the remedy.
-
-        `publishers` is how many publish the image topic, `elsewhere` other topics with images.
-        """
+    def silence(self, timeout_s: float) -> str:
+        """Return what to say when no image came for so long, with the remedy; else empty."""
+        if not self.enabled or self.silence_s() <= timeout_s:
+            return ""
+        elsewhere = self.around.elsewhere
         if self._counts["received"]:
-            why = f"{self._counts['received']} came before; the sender has paused or ended"
-        elif publishers == 0:
+            state = (
+                "the sender has paused or hangs: see to the camera and its driver"
+                if self.around.publishers
+                else "nobody publishes it any more: start the camera's driver again"
+            )
+            why = f"{self._counts['received']} came before; {state}"
+        elif not self.around.publishers:
             found = f"; images are on {', '.join(elsewhere)}" if elsewhere else ""
             why = f"nobody publishes it; remap {_relative(self._topic)} to the camera's{found}"
         else:
@@ -159,6 +188,25 @@ class Health:
                 f" not fit its shared memory; {self._remedy_at_sender()}"
             )
         return f"no image on {self._topic} for {self.silence_s():.0f} s: {why}"
+
+    def rivalry(self) -> str:
+        """Return what to say when others publish detections on the same topic; else empty."""
+        if not self.around.rivals:
+            return ""
+        return (
+            f"{', '.join(self.around.rivals)} publishes detections on the same topic, and who"
+            " listens takes both for one: end one of them, or give each a namespace"
+            " (-r __ns:=/east)"
+        )
+
+    def mixture(self) -> str:
+        """Return what to say when several send images on the one topic; else empty."""
+        if self.around.publishers < 2:
+            return ""
+        return (
+            f"{self.around.publishers} publish {self._topic}: if two cameras do, their skies are"
+            " mixed; give each camera a topic and a detector of its own"
+        )
 
     def losses(self) -> str:
         """Return what to say about frames lost a short while ago; empty if there are none."""
@@ -172,29 +220,49 @@ class Health:
             )
         return f"at least {lost} frames lost on the way: {self._remedy_at_sender()}"
 
-    def problems(
-        self, publishers: int, timeout_s: float, elsewhere: Sequence[str] = ()
-    ) -> list[str]:
-        """Return what is wrong now, in words; empty if nothing is."""
+    def problems(self, timeout_s: float, in_work_s: float = 0.0) -> tuple[list[str], list[str]]:
+        """Return what is wrong now, in words.
+
+        Parameters
+        ----------
+        timeout_s : float
+            What must happen once in a while is missed after so long, s.
+        in_work_s : float
+            How long the frame in work has been so, s.
+
+        Returns
+        -------
+        errors, warnings : list of str
+            What keeps it from detecting anything; what is merely not as it should be.
+        """
         drops = time.monotonic() - self._last_drop_s <= _RECENT_S
-        silent = self.enabled and self.silence_s() > timeout_s
         with self._lock:
-            failure = self._failure
+            failure, failures, result = self._failure, self._failures, self._result
+        failed = f"the last frame could not be processed: {failure}" if failure else ""
         unknown, faulty = self.directions
-        found = [
-            "" if self.enabled else "disabled by ~/enable: images are ignored",
-            self.silence(publishers, elsewhere) if silent else "",
+        stuck = stuck_words(in_work_s, timeout_s)
+        errors = [
+            stuck,
+            # Who is at a frame for so long may not have looked for the next.
+            "" if stuck else self.silence(timeout_s),
             self._incompatible if not self._counts["received"] else "",
-            self.losses(),
-            f"slower than the camera: {self._counts['dropped']} frames dropped" if drops else "",
-            f"the last frame could not be processed: {failure}" if failure else "",
+            failed if failures >= _FAILING else "",
             "images bear no stamp, without which there is no velocity: have the driver set"
             " header.stamp"
             if self._zero_stamp
             else "",
+        ]
+        warnings = [
+            "" if self.enabled else "disabled by ~/enable: images are ignored",
+            self.rivalry(),
+            self.mixture(),
+            self.losses(),
+            f"slower than the camera: {self._counts['dropped']} frames dropped" if drops else "",
+            failed if failures < _FAILING else "",
+            f"nothing is seen: {result.reason}" if result and not len(result.objects) else "",
             f"directions are unknown: {unknown}" if faulty else "",
         ]
-        return [problem for problem in found if problem]
+        return [words for words in errors if words], [words for words in warnings if words]
 
     def summary(self) -> str:
         """Return the state in words when nothing is wrong."""
@@ -239,8 +307,19 @@ class Health:
     def _remedy_at_sender(self) -> str:
         return (
             "start the camera driver with"
-            f" FASTRTPS_DEFAULT_PROFILES_FILE={self._profile} (the sender's setting decides)"
+            f" FASTRTPS_DEFAULT_PROFILES_FILE={self._profile} (the sender's setting decides), and"
+            " see that /dev/shm has room for it"
         )
+
+
+def stuck_words(in_work_s: float, timeout_s: float) -> str:
+    """Return what to say of a frame that is in work for longer than the timeout; else empty."""
+    if in_work_s <= timeout_s:
+        return ""
+    return (
+        f"the frame in work takes {in_work_s:.0f} s so far: if it does not end, restart the"
+        " detector; if all are slow, bin the images or raise threshold_sigmas"
+    )
 
 
 def _frame_values(result: FrameResult) -> dict[str, Any]:

@@ -10,12 +10,9 @@ import array
 import math
 import struct
 import sys
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, Vector3Stamped
 from sensor_msgs.msg import Image, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
@@ -41,7 +38,6 @@ __all__ = [
     "cloud_rows",
     "detections_array",
     "detections_cloud",
-    "diagnostic",
     "flow_markers",
     "header_stamp_ns",
     "image_message",
@@ -124,22 +120,6 @@ def picture_array(message: Image) -> np.ndarray:
     if message.encoding != "bgr8" or not whole or not message.data:
         raise MessageError(f"the picture is not bgr8 without padding but {message.encoding!r}")
     return np.frombuffer(message.data, np.uint8).reshape(shape)
-
-
-def diagnostic(
-    name: str, problems: list[str], summary: str, values: Mapping[str, Any]
-) -> DiagnosticStatus:
-    """Return a status: WARN with the problems if there are any, else OK with the summary."""
-    return DiagnosticStatus(
-        level=DiagnosticStatus.WARN if problems else DiagnosticStatus.OK,
-        name=name,
-        message="; ".join(problems) or summary,
-        values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()],
-    )
-
-
-def _text(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _bytes_array(pixels: np.ndarray) -> array.array:

@@ -2,22 +2,44 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from importlib import resources
 
+from ofsat_ros.nodes.start import END_SIGNALS
+
+_START = (sys.executable, "-m", "ofsat_ros.nodes.start")
+_PROFILE = resources.files("ofsat_ros").joinpath("data/fastdds_this_machine.xml")
 _PATIENCE_S = {signal.SIGINT: 5.0, signal.SIGTERM: 2.0, signal.SIGKILL: 2.0}
 
 
-def own_graph() -> dict[str, str]:
-    """Return what an environment sets so that its nodes neither hear nor disturb other graphs."""
+@functools.cache
+def own_graph() -> Mapping[str, str]:
+    """Return what an environment sets so that its nodes neither hear nor disturb other graphs.
+
+    Whatever the user's environment says: a mount that listens there must not obey a demo.
+    """
+    domain = 1 + os.getpid() % 100
+    if os.environ.get("ROS_DOMAIN_ID") == f"{domain}":
+        domain += 1
     return {
-        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
+        "ROS_DOMAIN_ID": f"{domain}",
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_STATIC_PEERS": "",
+        "FASTRTPS_DEFAULT_PROFILES_FILE": f"{_PROFILE}",
     }
+
+
+def stop_on_signals() -> None:
+    """Have signals raise KeyboardInterrupt; but who was told to outlive his terminal does so."""
+    for number in END_SIGNALS:
+        if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, signal.default_int_handler)
 
 
 @contextmanager
@@ -25,15 +47,15 @@ def children() -> Iterator[Callable[..., subprocess.Popen]]:
     """Give a function that starts a node; all that were started are ended in any case.
 
     The function takes the node's name and what follows ``--ros-args``; with ``piped=True``, what
-    the node prints is to be read from the process's `stdout`.  The nodes are in the graph of the
-    environment, or else in one of their own.
+    the node prints is to be read from the process's `stdout`.  The nodes are in a graph of their
+    own.
     """
     running: list[subprocess.Popen] = []
-    environment = {**own_graph(), **os.environ}
+    environment = {**os.environ, **own_graph()}
 
     def start(node: str, *ros_arguments: str, piped: bool = False) -> subprocess.Popen:
         output = subprocess.PIPE if piped else None
-        command = [sys.executable, "-m", f"ofsat_ros.nodes.{node}", "--ros-args", *ros_arguments]
+        command = [*_START, node, "--ros-args", *ros_arguments]
         with _signals_held_back():
             # An own session: Ctrl-C reaches this process, which then ends them in order.
             process = subprocess.Popen(
@@ -52,11 +74,12 @@ def children() -> Iterator[Callable[..., subprocess.Popen]]:
 
 @contextmanager
 def _signals_held_back() -> Iterator[None]:
-    """Let SIGINT and SIGTERM wait: a process that starts just now must be known, to be ended."""
+    """Let signals wait: a process that starts just now must be known, to be ended."""
     came: list[int] = []
     before = {
         number: signal.signal(number, lambda *_: came.append(1))
-        for number in (signal.SIGINT, signal.SIGTERM)
+        for number in END_SIGNALS
+        if signal.getsignal(number) != signal.SIG_IGN
     }
     try:
         yield

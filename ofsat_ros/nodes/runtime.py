@@ -1,9 +1,9 @@
 """What all nodes share: how a process becomes a node, and how it ends.
 
 `run` is the whole of a node's ``main``: it readies allocator and middleware for large images,
-starts the node, serves its callbacks in one thread, and ends it in order on SIGINT, SIGTERM or
-when the node itself sets its stop event.  `Inbox` hands messages from the callbacks to a node's
-own worker thread, so that a slow frame delays no service, parameter or diagnostic.
+starts the node, serves its callbacks in one thread, and ends it in order on SIGINT, SIGTERM,
+SIGHUP or when the node itself sets its stop event.  `Inbox` hands messages from the callbacks to a
+node's own worker thread, so that a slow frame delays no service or parameter.
 """
 
 from __future__ import annotations
@@ -22,24 +22,29 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import resources
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 import rclpy
+from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
+from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
 from rclpy.qos_overriding_options import QoSOverridingOptions, QoSPolicyKind
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import CameraInfo
 
+from ofsat_ros.nodes import shared_memory
 from ofsat_ros.nodes.ros_parameters import refuse_unknown
+from ofsat_ros.nodes.start import END_SIGNALS
 from ofsat_ros.parameters import ParameterError
 
 STARTED_WRONGLY = 2  # exit code; the same as argparse's
 
 _PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
-# How long a node's own threads may take to end: signals must end it within a second.
+# How long a node's own threads, or the middleware, may take to end, or a node to be made: signals
+# must end it within a second.
 _PATIENCE_S = 0.5
 
 
@@ -73,6 +78,7 @@ class Inbox:
         self._backlog_s = backlog_s
         self._items: deque[tuple[Any, int, float]] = deque()  # message, size, when it came
         self._bytes = 0
+        self._taken_s: float | None = None  # when the message in work was taken
         self.closed = False
         self._overloaded, self._replaced_s = False, 0.0
         self._changed = threading.Condition()
@@ -101,6 +107,7 @@ class Inbox:
     def get(self) -> Any | None:
         """Wait for the next message and return it; None once closed."""
         with self._changed:
+            self._taken_s = None
             if self._overloaded and not self._items:
                 self._overloaded = time.monotonic() - self._replaced_s <= (self._backlog_s or 0)
             self._changed.wait_for(lambda: self.closed or self._items)
@@ -108,8 +115,14 @@ class Inbox:
                 return None
             item, size, _ = self._items.popleft()
             self._bytes -= size
+            self._taken_s = time.monotonic()
             self._changed.notify_all()
             return item
+
+    def in_work_s(self) -> float:
+        """Return how long the worker has been at its last message, s; 0 if it waits for one."""
+        taken_s = self._taken_s
+        return 0.0 if taken_s is None else time.monotonic() - taken_s
 
     def close(self) -> None:
         """Release whoever waits; what is inside is dropped."""
@@ -184,29 +197,58 @@ def run(
         Exit code of a node that could not start: 2.  Of others the process ends here: with 0 after
         an orderly end, 1 after a failure.
     """
-    stop = threading.Event()
-
-    def on_signal(*_: object) -> None:
-        # Not here: this may have interrupted the main thread while it holds the event's own lock.
-        _thread.start_new_thread(stop.set, ())
-
-    # Ours instead of rclpy's or Python's: no exception then breaks into whatever runs.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, on_signal)
-    prepare_for_large_images()
+    stop, made = threading.Event(), threading.Event()
+    _end_on_signals(stop, made)
+    shortage = prepare_for_large_images()
     node = None
     try:
         options = parser.parse_args(remove_ros_args(sys.argv)[1:])
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         node = make_node(stop, options)
         refuse_unknown(node)
-    except (ParameterError, StartError, RuntimeError) as error:
-        sys.stderr.write(f"{parser.prog}: {_one_line(error)}\n")
+    # rclpy's own: use_sim_time or a QoS of the wrong type.
+    except (ParameterError, ParameterException, StartError, RuntimeError) as error:
+        say(f"{parser.prog}: {_one_line(error)}", sys.stderr)
         if node is not None:
             node.close()
         rclpy.try_shutdown()
         return STARTED_WRONGLY
+    made.set()
+    if shortage:
+        node.get_logger().warning(shortage)
     return _serve(node, stop)
+
+
+def say(line: str, where: TextIO | None = None) -> None:
+    """Print a line; without a reader (``| head``, a closed terminal) the node works on.
+
+    Parameters
+    ----------
+    line : str
+    where : TextIO, optional
+        Default: standard output.
+    """
+    where = where or sys.stdout
+    try:
+        where.write(line + "\n")
+        where.flush()
+    except OSError:
+        with open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), where.fileno())
+
+
+def qos_explained(node: Node, topic: str) -> SubscriptionEventCallbacks:
+    """Return what has a subscription say why a publisher cannot be heard, and what to do."""
+    name = node.resolve_topic_name(topic)
+
+    def explain(event: QoSRequestedIncompatibleQoSInfo) -> None:
+        policy = qos_policy_name_from_kind(event.last_policy_kind).lower()
+        node.get_logger().warning(
+            f"a publisher of {name} cannot be heard, since it offers another {policy}: set"
+            f" qos_overrides.{name}.subscription.{policy} of this node to what it offers"
+        )
+
+    return SubscriptionEventCallbacks(incompatible_qos=explain)
 
 
 def hear_camera_info(node: Node, take: Callable[[CameraInfo], None]) -> None:
@@ -219,10 +261,45 @@ def hear_camera_info(node: Node, take: Callable[[CameraInfo], None]) -> None:
     )
 
 
-def prepare_for_large_images() -> None:
-    """Ready allocator and middleware for images of megabytes; call before ``rclpy.init``."""
+def prepare_for_large_images() -> str:
+    """Ready allocator and middleware for images of megabytes; call before ``rclpy.init``.
+
+    Returns
+    -------
+    str
+        What is wrong with the machine's shared memory; empty if nothing is.
+    """
     _keep_large_buffers()
-    _use_packaged_profile()
+    if os.environ.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp") != "rmw_fastrtps_cpp":
+        return ""
+    shared_memory.remove_abandoned()
+    # Unless the user chose for himself.
+    if not any(os.environ.get(name) for name in _PROFILE_VARIABLES):
+        os.environ[_PROFILE_VARIABLES[0]] = profile_path()
+    chosen = next(os.environ[name] for name in _PROFILE_VARIABLES if os.environ.get(name))
+    return shared_memory.shortage(chosen)
+
+
+def _end_on_signals(stop: threading.Event, made: threading.Event) -> None:
+    """Have signals set the stop event, or end the process if it takes long to make the node."""
+
+    def end() -> None:
+        stop.set()
+        if not made.wait(_PATIENCE_S):  # a large bag that is opened, say: nothing is written yet
+            _leave(0)
+
+    # Ours instead of rclpy's or Python's: no exception then breaks into whatever runs.
+    for number in END_SIGNALS:
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+            # Not at once: this may have interrupted the main thread while it holds the event's
+            # own lock.
+            signal.signal(number, lambda *_: _thread.start_new_thread(end, ()))
+
+
+def _leave(code: int) -> NoReturn:
+    """End the process at once; the middleware's shared memory does not outlive it."""
+    shared_memory.remove_own()
+    os._exit(code)
 
 
 def _serve(node: Node, stop: threading.Event) -> NoReturn:
@@ -247,6 +324,11 @@ def _serve(node: Node, stop: threading.Event) -> NoReturn:
     thread.start()
     stop.wait()
     node.close()
+    code = getattr(node, "exit_code", 0)
+    # What follows is the middleware's: it is not waited for longer than is usual.
+    last = threading.Timer(2 * _PATIENCE_S, _leave, (code,))
+    last.daemon = True
+    last.start()
     executor.create_task(lambda: None)  # the only thing that makes spin_once return
     thread.join(_PATIENCE_S)
     executor.shutdown()
@@ -254,12 +336,11 @@ def _serve(node: Node, stop: threading.Event) -> NoReturn:
     node.destroy_node()
     rclpy.try_shutdown()
     if failures:
+        last.cancel()
         raise failures[0]
-    sys.stdout.flush()
-    sys.stderr.flush()
     # All that is ours is closed.  Python's own end would take longer than that, and would pull the
     # ground from under a thread that is still inside a long native call.
-    os._exit(getattr(node, "exit_code", 0))
+    _leave(code)
 
 
 def _one_line(error: Exception) -> str:
@@ -275,14 +356,6 @@ def _keep_large_buffers() -> None:
     mallopt(mmap_max, 0)
     mallopt(trim_threshold, 2_000_000_000)
     mallopt(arena_max, 1)
-
-
-def _use_packaged_profile() -> None:
-    """Point Fast DDS at the profile for large images, unless the user chose for himself."""
-    if os.environ.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp") != "rmw_fastrtps_cpp":
-        return
-    if not any(os.environ.get(name) for name in _PROFILE_VARIABLES):
-        os.environ[_PROFILE_VARIABLES[0]] = profile_path()
 
 
 def profile_path() -> str:
