@@ -26,6 +26,7 @@ help:
 	$(say) 'make demo-guide  a simulated mount follows a satellite; results in demo_guide_output/'
 	$(say) 'make test   run all tests'
 	$(say) 'make lint   check format, style and types'
+	$(say) 'make audit  look for known vulnerabilities in what is installed'
 	$(say) "make bench  the paper's scenes, detection beside its peers, and speed, as tables"
 	$(say) 'make clean  remove everything that make and colcon made'
 
@@ -54,6 +55,13 @@ lint: $(STAMP)
 	@$(BIN)/ruff check .
 	$(say) 'lint: types'
 	@$(BIN)/mypy
+
+.PHONY: audit
+audit: $(STAMP)
+	$(say) 'audit: whether the packages fit each other'
+	@$(BIN)/python -m pip check --disable-pip-version-check
+	$(say) 'audit: known vulnerabilities'
+	@$(BIN)/python .ci/audit.py
 
 .PHONY: bench
 bench: $(STAMP)
