@@ -225,7 +225,7 @@ def test_pip_installs_the_same_commands(metadata: importlib.metadata.Distributio
     commands = {entry.name: entry.value for entry in metadata.entry_points}
     assert commands == {
         "ofsat": "ofsat_ros.cli:main",
-        **{node: f"ofsat_ros.nodes.{node}:main" for node in NODES},
+        **{node: f"ofsat_ros.nodes.start:{node}" for node in NODES},
     }
     assert all(callable(entry.load()) for entry in metadata.entry_points)
 

@@ -28,6 +28,7 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 INTEGRATION = (ROOT / "docs" / "integration.md").read_text()
 TROUBLESHOOTING = (ROOT / "docs" / "troubleshooting.md").read_text()
+RELIABILITY = (ROOT / "docs" / "reliability.md").read_text()
 # Pages with commands for users; the README's are those of `.venv`.
 PAGES = (
     "README.md",
@@ -237,18 +238,41 @@ def texts(tree: ast.AST) -> Iterator[str]:
             yield node.value
 
 
-def test_messages_that_are_explained_are_the_programs() -> None:
-    said = {
+def messages() -> set[str]:
+    """Every string that the program may say, among others."""
+    return {
         text
         for path in (ROOT / "ofsat_ros").rglob("*.py")
         for text in texts(ast.parse(path.read_text()))
     }
+
+
+def says(row: str, said: set[str]) -> bool:
+    pieces = [re.escape(piece.strip()) for piece in row.split("...") if piece.strip()]
+    pattern = re.compile(r"[\s\S]*".join(pieces))
+    return any(pattern.search(text) for text in said)
+
+
+def test_messages_that_are_explained_are_the_programs() -> None:
+    said = messages()
     rows = re.findall(r"^\| `(.+?)` \|", TROUBLESHOOTING, re.M)
     assert len(rows) > 30
     for row in rows:
-        pieces = [re.escape(piece.strip()) for piece in row.split("...") if piece.strip()]
-        pattern = re.compile(r"[\s\S]*".join(pieces))
-        assert any(pattern.search(text) for text in said), f"no message says {row!r}"
+        assert says(row, said), f"no message says {row!r}"
+
+
+def test_each_fault_has_its_words_and_its_test() -> None:
+    said = messages()
+    rows = re.findall(r"^\| ([^|]+) \| ([^|]+) \| ([^|]+) \| ([^|]+) \|$", RELIABILITY, re.M)
+    rows = [row for row in rows if row[0] != "fault" and set(row[0]) != {"-"}]
+    assert len(rows) > 30
+    for fault, seen, _, proof in rows:
+        for words in re.findall(r"`([^`]+)`", seen):
+            assert says(words, said), f"{fault}: no message says {words!r}"
+        proofs = re.findall(r"`(\w+)::(\w+)`", proof)
+        assert proofs, fault
+        for file, test in proofs:
+            assert f"\ndef {test}(" in (ROOT / "test" / f"{file}.py").read_text(), (fault, test)
 
 
 def anchors(text: str) -> set[str]:
