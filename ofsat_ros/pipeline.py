@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from contextlib import contextmanager, suppress
 from functools import partial
 
 import numpy as np
@@ -24,7 +23,6 @@ from ofsat_ros.comparison import (
     why_not_comparable,
 )
 from ofsat_ros.detection import (
-    DETECTION_DTYPE,
     Drift,
     detect,
     find_drifting,
@@ -32,14 +30,15 @@ from ofsat_ros.detection import (
     refine,
     spot_near,
 )
+from ofsat_ros.frame_result import FrameResult, why_nothing
 from ofsat_ros.history import History, PastFrame
-from ofsat_ros.objects import OBJECT_DTYPE, find_objects
-from ofsat_ros.optical_flow import Flow, FlowInput
+from ofsat_ros.objects import find_objects
+from ofsat_ros.optical_flow import FlowInput
 from ofsat_ros.parameters import Parameters
 from ofsat_ros.pixels import Regions, rows_and_columns
-from ofsat_ros.preprocessing import Preprocessed, SensorMemory, blank_words, preprocess
+from ofsat_ros.preprocessing import Preprocessed, SensorMemory, preprocess
 from ofsat_ros.star_field import StarFieldMotion
-from ofsat_ros.timeline import Timeline
+from ofsat_ros.timeline import AstrayError, Timeline
 from ofsat_ros.tracking import TRACK_DTYPE, Settled, Tracker
 
 _SMALLEST_SIDE = 16
@@ -52,75 +51,6 @@ _BLIND_FRAMES = 3
 
 class ImageError(ValueError):
     """An image that the pipeline cannot process; the message says why."""
-
-
-@dataclass
-class FrameResult:
-    """What one frame gave.
-
-    Attributes
-    ----------
-    stamp_ns : int
-        Its stamp, ns UTC.
-    frame : int
-        Count of frames that the pipeline processed before it.
-    shape : (height, width)
-        Size of the image, px.
-    dt_s : float
-        Time since the frame it was compared with, s; NaN if there was none.
-    reset : str
-        Why there was none, in words; empty if there was.
-    objects : (N,) OBJECT_DTYPE
-        Objects of this frame.
-    flow : Flow
-        Flow from the previous frame to this one.
-    star_field : StarFieldMotion or None
-        Motion of the star field; None if it was not found.
-    detections : (K,) DETECTION_DTYPE
-        RSOs in this frame, confirmed ones and candidates.
-    tracks : (N,) TRACK_DTYPE
-        Confirmed tracks, coasting ones included; test history only.
-    settled : list of Settled
-        The last word on frames, in their order, with what later frames taught: the look back.
-        Without test history, of this frame.
-    spot_count : int
-        Spots that are not the star field's: RSOs, noise, cosmic rays, defects.
-    background, noise, threshold : float
-        Median level of the background, std of the smoothed background, threshold over the
-        background, DN.
-    reason : str
-        Why nothing was detected, in words; empty if something was.
-    seconds : dict
-        Time that each stage took, s.
-    """
-
-    stamp_ns: int
-    frame: int
-    shape: tuple[int, int]
-    dt_s: float = float("nan")
-    reset: str = ""
-    objects: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, OBJECT_DTYPE))
-    flow: Flow = field(default_factory=Flow.empty)
-    star_field: StarFieldMotion | None = None
-    detections: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, DETECTION_DTYPE))
-    tracks: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, TRACK_DTYPE))
-    settled: list[Settled] = field(default_factory=list)
-    spot_count: int = 0
-    background: float = float("nan")
-    noise: float = float("nan")
-    threshold: float = float("nan")
-    reason: str = ""
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def star_rows(self) -> NDArray[np.intp]:
-        """Rows of the flow that are stars': they move with the field and are no detection's."""
-        if self.star_field is None:
-            return np.zeros(0, np.intp)
-        own = self.detections["object_index"]
-        of_rso = np.isin(self.flow.object_index, own[own >= 0])
-        of_rso[self.detections["flow_index"][self.detections["flow_index"] >= 0]] = True
-        return np.flatnonzero(self.star_field.inliers & ~of_rso)
 
 
 class Pipeline:
@@ -144,6 +74,8 @@ class Pipeline:
         self.parameters = parameters or Parameters.preset()
         self._previous: Seen | None = None
         self._timeline = Timeline()
+        # An image whose stamp is not believed yet, with that stamp.
+        self._held: tuple[NDArray[np.generic], int] | None = None
         self._sensor = SensorMemory()
         self._history = History(self.parameters.history_frames)
         look = partial(spot_near, radius_px=_CLOSER_PX, least_sigmas=_CLOSER_SIGMAS)
@@ -189,7 +121,8 @@ class Pipeline:
         Parameters
         ----------
         image : (H, W) uint8, uint16 or float32
-            The image, DN; at least 16 px on each side.  It is not changed.
+            The image, DN; at least 16 px on each side.  It is not changed, and must not be before
+            the next one.
         stamp_ns : int
             Middle of the exposure, ns UTC.
 
@@ -201,17 +134,43 @@ class Pipeline:
         ------
         ImageError
             If the image has another type or shape, or no finite pixel, or its stamp is astray
-            (`Timeline`).  The previous frame stays as it was.
+            (`Timeline`).  The previous frame stays as it was.  If the next stamp goes on from
+            one that was astray, its result brings what this frame gave.
         """
         _check(image)
         try:
-            return self._process(image, stamp_ns)
+            return self._follow(image, stamp_ns)
         except ImageError:
             raise
         except BaseException:
             # A fault, or Ctrl-C: what is half done must not go on into the next frames.
             self.reset("an error in the frame before")
             raise
+
+    def _follow(self, image: NDArray[np.generic], stamp_ns: int) -> FrameResult:
+        """Refuse a stamp that is astray; start afresh where time has jumped."""
+        held, self._held = self._held, None
+        if self._previous is None:
+            self._timeline = Timeline()
+        try:
+            jump_s = self._timeline.judge(stamp_ns)
+        except AstrayError as error:
+            if self._timeline.awaits(stamp_ns):
+                self._held = image, stamp_ns
+            raise ImageError(str(error)) from error
+        before = None
+        if jump_s:
+            how = "jumped ahead" if jump_s > 0 else "ran backwards"
+            self.reset(f"time {how} by {abs(jump_s):g} s")
+            if held is not None:
+                with suppress(ImageError):
+                    before = self._process(*held)
+        result = self._process(image, stamp_ns)
+        self._timeline.take(stamp_ns)
+        if before is not None:
+            result.held_back = before
+            result.settled, before.settled = before.settled + result.settled, []
+        return result
 
     def _process(self, image: NDArray[np.generic], stamp_ns: int) -> FrameResult:
         parameters = self.parameters
@@ -220,7 +179,6 @@ class Pipeline:
         spare, self._spare = self._spare, None
         with _timed(result.seconds, "preprocessing"):
             try:
-                self._follow(stamp_ns)
                 pre = preprocess(image, parameters, self._sensor, spare)
             except ValueError as error:
                 raise ImageError(str(error)) from error
@@ -263,16 +221,8 @@ class Pipeline:
         if not 0 < self._blind <= _BLIND_FRAMES:
             self._previous = current
             self._since = self._history[-1].to_sky if len(self._history) else None
-        result.reason = _why_nothing(result, image, pre.veiled)
+        result.reason = why_nothing(result, image, pre.veiled)
         return result
-
-    def _follow(self, stamp_ns: int) -> None:
-        """Refuse a stamp that is astray; start afresh where time has jumped."""
-        if self._previous is None:
-            self._timeline = Timeline()
-        if jump_s := self._timeline.follow(stamp_ns):
-            how = "jumped ahead" if jump_s > 0 else "ran backwards"
-            self.reset(f"time {how} by {abs(jump_s):g} s")
 
     def _compare(
         self, previous: Seen, current: Seen, result: FrameResult, parameters: Parameters
@@ -408,30 +358,3 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     start = time.perf_counter()
     yield
     seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start
-
-
-def _why_nothing(result: FrameResult, image: NDArray[np.generic], veiled: bool) -> str:
-    """In words, why the frame has no detection."""
-    if len(result.detections):
-        return ""
-    if veiled:
-        return "most of the image is structure, not noise: clouds or bands hide what is faint"
-    if not len(result.objects):
-        return blank_words(image) or "no object is above the threshold"
-    if result.reset:
-        return f"no previous frame to compare with: {result.reset}"
-    valid = int(np.count_nonzero(result.flow.valid))
-    if not valid:
-        return f"none of {len(result.objects)} objects was found in the previous frame"
-    if valid == 1:
-        return "only one object was found in the previous frame: no star field to compare it with"
-    if result.star_field is None:
-        return f"the {valid} flow vectors do not agree on a motion of the star field"
-    stars = result.star_field.star_count
-    if not result.spot_count:
-        return f"everything moves with the star field ({stars} stars)"
-    coasting = f"; tracks that coast: {len(result.tracks)}" if len(result.tracks) else ""
-    return (
-        f"{stars} stars; none of {result.spot_count} spots beside them lies on a path that noise"
-        f" would not explain{coasting}"
-    )

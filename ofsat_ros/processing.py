@@ -151,6 +151,8 @@ class Processing:
         self._writer: ResultWriter
         self._bag: ResultBag | None
         self._refused = 0
+        # The frame before with its camera, if it was refused, and why: the next may confirm it.
+        self._held: tuple[Frame, Camera | None, str] | None = None
         self._misfit = self._calibrated = False
         self._seen: dict[int, _Seen] = {}  # by the pipeline's number
         self._settled: list[Settled] = []  # until the attitudes after their frames are known
@@ -192,6 +194,7 @@ class Processing:
             with totals.timed("the last frames' last word"):
                 self._settled += self._pipeline.finish()
                 self._write_settled()
+            self._leave_out_held()
             totals.reading_s = frames.seconds
             totals.left_out = self._refused + frames.skipped
             if more := max(totals.resets - _RESETS_TOLD, 0):
@@ -220,10 +223,28 @@ class Processing:
                 result = self._pipeline.process(frame.image, middle_ns)
                 stages |= result.seconds
         except ImageError as error:
-            self._refused += 1
-            if self._refused == 1:
-                self.note(f"frame {frame.number} is left out, and others like it: {error}")
+            self._leave_out_held()
+            self._held = frame, camera, f"{error}"
             return
+        if result.held_back is not None and self._held is not None:
+            self._see(*self._held[:2], result.held_back)
+            self._held = None
+        self._leave_out_held()
+        self._see(frame, camera, result)
+        self._settled += result.settled
+
+    def _leave_out_held(self) -> None:
+        """Give up the frame before, if it was refused: it stays so."""
+        if self._held is None:
+            return
+        (frame, _, why), self._held = self._held, None
+        self._refused += 1
+        if self._refused == 1:
+            self.note(f"frame {frame.number} is left out, and others like it: {why}")
+
+    def _see(self, frame: Frame, camera: Camera | None, result: FrameResult) -> None:
+        """Write what is known of a frame at once, and what its last word will need."""
+        totals = self.totals
         if result.reset and totals.frames:
             totals.resets += 1
             if totals.resets <= _RESETS_TOLD:
@@ -234,7 +255,6 @@ class Processing:
             self._writer.add_star_field(replace(result, frame=frame.number))
             if self._live:
                 self._write(seen, result.detections)
-        self._settled += result.settled
         totals.add_frame(result)
 
     def _camera_of(self, frame: Frame) -> Camera | None:

@@ -5,6 +5,7 @@ data, so that all of them leave out the same frames.  A clock that is set, a dri
 stamp, a frame that comes twice, late, or from another camera: a single stamp that does not go on
 where the others ended is not believed, and costs its own frame only.  When the next frame goes on
 from there, time has jumped indeed: a recording begins anew, the clock was set, the camera paused.
+Then both frames count.
 """
 
 from __future__ import annotations
@@ -29,8 +30,18 @@ class Timeline:
         self._astray_ns: int | None = None
         self._intervals: deque[int] = deque(maxlen=_KEPT)
 
+    def awaits(self, stamp_ns: int) -> bool:
+        """Whether this stamp, just refused, will be believed if the next goes on from it."""
+        return self._astray_ns == stamp_ns
+
     def follow(self, stamp_ns: int) -> float:
-        """Take the next frame.
+        """`judge` the stamp of the next frame, and `take` it."""
+        jump_s = self.judge(stamp_ns)
+        self.take(stamp_ns)
+        return jump_s
+
+    def judge(self, stamp_ns: int) -> float:
+        """Say whether a frame is the next one.
 
         Parameters
         ----------
@@ -40,8 +51,8 @@ class Timeline:
         Returns
         -------
         float
-            0 if the frame follows the one before; if time has jumped between the two, by how much,
-            s: below 0 if backwards.
+            0 if the frame follows the one before; if time has jumped from that to the frame that
+            was left out meanwhile, by how much, s: below 0 if backwards.
 
         Raises
         ------
@@ -51,21 +62,23 @@ class Timeline:
             was left out just before for that.
         """
         if self._newest_ns is None:
-            self._newest_ns = stamp_ns
             return 0.0
         step_ns = stamp_ns - self._newest_ns
         if not step_ns:
             raise AstrayError("it has the same stamp as the frame before")
-        jumped = not self._goes_on(self._newest_ns, stamp_ns)
-        if jumped:
-            astray_ns, self._astray_ns = self._astray_ns, stamp_ns
-            if astray_ns is None or not self._goes_on(astray_ns, stamp_ns):
-                raise AstrayError(_words(step_ns))
+        if self._goes_on(self._newest_ns, stamp_ns):
+            return 0.0
+        astray_ns, self._astray_ns = self._astray_ns, stamp_ns
+        if astray_ns is None or not self._goes_on(astray_ns, stamp_ns):
+            raise AstrayError(_words(step_ns))
+        return (astray_ns - self._newest_ns) / _NS
+
+    def take(self, stamp_ns: int) -> None:
+        """Take a frame as the one that the next is judged by."""
         # A pause that proved to be one may come again.
-        if step_ns > 0:
-            self._intervals.append(step_ns)
+        if self._newest_ns is not None and stamp_ns > self._newest_ns:
+            self._intervals.append(stamp_ns - self._newest_ns)
         self._newest_ns, self._astray_ns = stamp_ns, None
-        return step_ns / _NS if jumped else 0.0
 
     def _goes_on(self, before_ns: int, stamp_ns: int) -> bool:
         longest_ns = _LONGEST * max(self._intervals, default=1 << 62)

@@ -307,13 +307,12 @@ def test_the_same_frames_give_the_same_results():
 
 def test_the_image_is_not_changed():
     pipeline = Pipeline()
-    for frame in range(2):
-        for dtype in (np.uint16, np.float32):
-            image = SURVEY.image(frame).astype(dtype)
-            before = image.copy()
-            image.flags.writeable = False
-            pipeline.process(image, stamp(frame))
-            assert np.array_equal(image, before)
+    for frame, dtype in enumerate((np.uint16, np.float32, np.float32)):
+        image = SURVEY.image(frame).astype(dtype)
+        before = image.copy()
+        image.flags.writeable = False
+        pipeline.process(image, stamp(frame))
+        assert np.array_equal(image, before)
 
 
 def test_a_view_with_strides_gives_what_its_copy_gives():
