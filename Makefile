@@ -44,8 +44,10 @@ demo-guide: $(STAMP)
 
 .PHONY: test
 test: $(STAMP)
-	$(say) 'test: all tests, nodes over DDS and a colcon build among them'
-	@$(BIN)/python -m pytest
+	$(say) 'test: what needs no ROS, on several cores'
+	@$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile -m 'not graph'
+	$(say) 'test: nodes over DDS and a colcon build, one after the other'
+	@$(BIN)/python -m pytest -m graph
 
 .PHONY: lint
 lint: $(STAMP)

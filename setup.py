@@ -34,6 +34,7 @@ TEST = [
     "hypothesis",
     "mcap",  # writes what we read
     "pytest>=9",
+    "pytest-xdist",
     "sep",
     *(*SKY, *PLOT, *REPORT, "sgp4"),
     *("ccsds-ndm", "lxml"),  # reads back what we write; GPL, so for tests only
