@@ -143,7 +143,7 @@ def sending(function: Callable[..., None], *arguments: Any) -> Iterator[Any]:
 @contextmanager
 def detecting(*ros_arguments: str) -> Iterator[subprocess.Popen]:
     """Run a detector; whatever happens, it ends."""
-    command = [sys.executable, "-m", "ofsat_ros.nodes.detector", "--ros-args"]
+    command = [sys.executable, "-m", "ofsat_ros.nodes.start", "detector", "--ros-args"]
     process = subprocess.Popen([*command, "--log-level", "warn", *ros_arguments])
     try:
         yield process

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections import namedtuple
+from collections import Counter, namedtuple
 from collections.abc import Callable
 from io import TextIOWrapper
 from pathlib import Path
@@ -50,7 +50,6 @@ def mapped(node: Process) -> str:
         ("numpy", signal.SIGINT),  # amid the imports
         ("_rclpy", signal.SIGTERM),
         (r"/dev/shm/fastrtps_\w{16}", signal.SIGHUP),  # it has just joined the graph
-        (r"/dev/shm/fastrtps_\w{16}", signal.SIGINT),
     ],
 )
 def test_a_node_that_starts_ends_when_it_is_told_to(sign, number, tmp_path):
@@ -164,10 +163,17 @@ def test_too_little_shared_memory_is_said_with_the_remedy(free, monkeypatch, tmp
 
 
 def test_a_killed_detector_is_replaced_and_leaves_nothing(tmp_path):
-    with Graph() as graph, Process(tmp_path, "simulator", "--ros-args", "-p", "rate:=5.0"):
+    (frame,) = sky(1)
+    with Graph() as graph:
         heard = graph.listen(PointCloud2, "/rso_detections")
+        camera = graph.publisher(Image, "/image")
+
+        def answered(least: int) -> bool:
+            camera.publish(image(frame))
+            return len(heard) >= least
+
         with Process(tmp_path, "detector") as killed:
-            graph.until(lambda: heard, START_S)
+            graph.until(lambda: answered(1), START_S)
             # Ours alone: each process maps those that it hears, too.
             held = {Path(os.readlink(link)).name for link in fds(killed)}
             segments = {name.removesuffix("_el") for name in held if name.endswith("_el")}
@@ -178,9 +184,10 @@ def test_a_killed_detector_is_replaced_and_leaves_nothing(tmp_path):
         assert segments <= set(os.listdir(SHM))
         for name in segments:  # or wait for it to be older than a starting process's
             os.utime(SHM / f"{name}_el", (time.time() - 60,) * 2)
-        before = len(heard)
+        graph.serve(0.1)  # what it had still sent
+        least = len(heard) + 3
         with Process(tmp_path, "detector"):
-            graph.until(lambda: len(heard) > before + 2, START_S)
+            graph.until(lambda: answered(least), START_S)
         assert not segments & set(os.listdir(SHM))
 
 
@@ -208,7 +215,7 @@ def of_detector(graph: Graph) -> list[tuple[int, str, dict[str, str]]]:
 
 def test_a_camera_that_is_killed_and_started_again(tmp_path):
     parameters = (*("-p", "no_image_timeout_s:=1.0"), *("-p", "max_gap_s:=1.0"))
-    camera = ("simulator", "--ros-args", "-p", "rate:=10.0")
+    camera = ("simulator", "--ros-args", "-p", "rate:=5.0")
     with Graph(*parameters) as graph:
         said = of_detector(graph)
         graph.add(Detector(context=graph.context))
@@ -218,14 +225,16 @@ def test_a_camera_that_is_killed_and_started_again(tmp_path):
             graph.until(lambda: said[-1][0] == DiagnosticStatus.ERROR)
         assert "came before; the sender has paused or hangs: see to the camera" in said[-1][1]
         begun = len(said)
-        with Process(tmp_path, *camera):
+
+        def found_again() -> bool:
+            reasons = [values["nothing_detected_because"] for *_, values in said[begun:]]
+            if not any("no previous frame to compare with" in why for why in reasons):
+                return False
             # A busy machine may drop frames, which is a warning.
-            graph.until(
-                lambda: said[-1][0] != DiagnosticStatus.ERROR and said[-1][2]["stars"] != "0",
-                START_S,
-            )
-    reasons = [values["nothing_detected_because"] for *_, values in said[begun:]]
-    assert any("max_gap_s" in why or "no previous frame" in why for why in reasons)
+            return said[-1][0] != DiagnosticStatus.ERROR and said[-1][2]["stars"] != "0"
+
+        with Process(tmp_path, *camera):
+            graph.until(found_again, START_S)
     # The new sender counts from 1 again.
     assert said[-1][2]["frames_lost"] == "0"
 
@@ -244,10 +253,17 @@ def test_a_frame_that_does_not_end_is_said_while_nothing_else_goes_on(monkeypatc
         said = of_detector(graph)
         clouds = graph.listen(PointCloud2, "rso_detections")
         detector = graph.add(Detector(context=graph.context))
-        detector._inbox._limit_bytes = 0  # callbacks wait behind three frames, not 1 GiB
+        inbox, say_it = detector._inbox, detector._diagnostics.say
+        inbox._limit_bytes = 0  # callbacks wait behind three frames, not 1 GiB
+
+        def say_and_go_on(summary, values, errors, warnings) -> None:
+            say_it(summary, values, errors, warnings)
+            if "in work" in "".join(errors) and len(inbox._items) == 3:
+                go_on.set()
+
+        monkeypatch.setattr(detector._diagnostics, "say", say_and_go_on)
         camera = graph.publisher(Image, "image")
         graph.connect(camera)
-        threading.Timer(2.7, go_on.set).start()
         for frame in frames:
             camera.publish(image(frame))
             # Here callbacks stand still until the frame ends.
@@ -277,7 +293,7 @@ def test_two_detectors_in_one_namespace_are_said_and_in_two_are_not():
         said = of_detector(graph)
         for one in graphs:
             one.add(Detector(context=one.context))
-        serve_until(lambda: len(said) >= 6)
+        serve_until(lambda: len(said) >= 4)
         assert not any("the same topic" in message for _, message, _ in said)
         with Graph() as second:
             graphs.append(second)
@@ -291,40 +307,46 @@ def test_two_detectors_in_one_namespace_are_said_and_in_two_are_not():
 
 def test_every_node_says_how_it_is_as_aggregators_expect(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    heard: list[tuple[float, DiagnosticStatus]] = []
+    heard: list[DiagnosticStatus] = []
     beside = {"/guide: guidance", "/recorder: recording", "/tdm_writer: tracking data"}
     with Graph() as graph:
         graph.probe.create_subscription(
             DiagnosticArray,
             "/diagnostics",
-            lambda array: heard.extend((time.monotonic(), status) for status in array.status),
+            lambda array: heard.extend(array.status),
             100,
         )
         graph.add(GuideNode(context=graph.context))
         graph.add(Recorder(STOP, context=graph.context))
         graph.add(TdmWriter(STOP, context=graph.context))
-        graph.until(lambda: {status.name for _, status in heard} == beside)
+        graph.until(lambda: {status.name for status in heard} == beside)
         # Without a detector none of them can do its work.
-        for _, status in heard:
+        for status in heard:
             assert status.level == DiagnosticStatus.ERROR, status.name
             assert "is the detector running?" in status.message
         graph.add(Detector(context=graph.context))
-        graph.until(lambda: any(status.name.endswith("detection") for _, status in heard))
+        graph.until(lambda: any(status.name.endswith("detection") for status in heard))
         heard.clear()
-        graph.serve(2.5)
-    times: dict[str, list[float]] = {}
-    for at_s, status in heard:
-        times.setdefault(status.name, []).append(at_s)
+        begun_s, counts = time.monotonic(), Counter()
+
+        def each_twice() -> bool:
+            counts.clear()
+            counts.update(status.name for status in heard)
+            return len(counts) == 4 and min(counts.values()) >= 2
+
+        graph.until(each_twice)
+    assert counts.keys() == {*beside, "/detector: detection"}
+    # Once a second; how much later one is depends on the machine.
+    assert max(counts.values()) <= time.monotonic() - begun_s + 2
+    for status in heard:
         assert status.hardware_id
         # That is what an aggregator makes of silence.
         assert status.level != DiagnosticStatus.STALE
-    assert times.keys() == {*beside, "/detector: detection"}
-    assert all(2 <= len(of_node) <= 3 for of_node in times.values()), times
     analyzers = yaml.safe_load(ANALYZERS.read_text())["analyzers"]["ros__parameters"]
     wanted = [
         words for one in analyzers.values() if "contains" in one for words in one["contains"]
     ]
-    for name in {*times, "/east/detector: detection"}:
+    for name in {*counts, "/east/detector: detection"}:
         assert sum(words in name for words in wanted) == 1, name
 
 

@@ -73,6 +73,8 @@ def test_lost_frames_are_counted_from_the_senders_numbers(clock):
     (said,) = problems(one)
     assert "3 frames lost on the way" in said
     assert PROFILE in said
+    # The middleware counts what it cannot read as what did not come.
+    assert "or, if it is one now and then, the sender's messages are torn" in said
     clock[0] += 11
     one.image_received(9, has_stamp=True)
     assert problems(one) == []
@@ -93,6 +95,25 @@ def test_reliable_losses_have_another_remedy(clock):
     one.image_received(3, has_stamp=True)
     (said,) = problems(one)
     assert "queue_depth" in said
+
+
+@pytest.mark.parametrize("reliable", [True, False])
+def test_answers_that_come_late_are_a_warning_with_what_to_do(clock, reliable):
+    one = health(reliable)
+    one.image_received(1, has_stamp=True)
+    one.processed(frame(), latency_s=4.9, seconds={})
+    assert problems(one) == []
+    one.processed(frame(), latency_s=12.3, seconds={})
+    (said,) = problems(one)
+    assert said.startswith("answers come 12 s after their images")
+    assert said.endswith("slow the sender down, bin the images, or raise threshold_sigmas")
+    assert errors(one) == []
+    # No longer when nothing more is to be answered, nor when it has caught up.
+    clock[0] += 11
+    one.image_received(2, has_stamp=True)
+    assert problems(one) == []
+    one.processed(frame(), latency_s=0.2, seconds={})
+    assert problems(one) == []
 
 
 def test_a_failure_is_said_until_a_frame_succeeds(clock):

@@ -11,7 +11,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import QuaternionStamped
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParametersAtomically
-from ros_graph import Graph, Process, sky, stamps, write_bag
+from ros_graph import START_S, Graph, Process, sky, stamps, write_bag
 from rosgraph_msgs.msg import Clock
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
@@ -213,15 +213,28 @@ def test_a_truncated_message_is_skipped_and_said_once(tmp_path):
             writer.write_image("/image", frame.image, frame.stamp_ns, "left")
             cut = b"\0\1\0\0\1\2"
             writer.write("/image", "sensor_msgs/msg/Image", cut, frame.stamp_ns + 1)
+            # The middleware would ask for it again and again, and the player wait for ever.
+            attitude = "geometry_msgs/msg/QuaternionStamped"
+            writer.write("/attitude", attitude, b"", frame.stamp_ns + 2)
     arguments = (f"{tmp_path / 'bag'}", "--ros-args", "-p", "rate:=0")
     with Process(tmp_path, "player", *arguments) as player, Graph() as graph:
         heard = graph.listen(Image, "/image")
+        graph.listen(QuaternionStamped, "/attitude")
         graph.until(lambda: len(heard) == 4)
         assert player.wait() == 0
     assert stamps(heard) == TIMES[:4]
     assert player.err.count("is skipped: it has 6 bytes") == 1
     assert "played 4 frames" in player.err
-    assert "4 truncated ones skipped" in player.err
+    assert "8 truncated ones skipped" in player.err
+
+
+def test_a_recorded_topic_that_is_no_name_is_one_line_that_no_terminal_obeys(tmp_path):
+    bag = write_bag(tmp_path / "bag", FRAMES[:2], "/camera\x1b[2J/image")
+    with Process(tmp_path, "player", f"{bag}") as player:
+        assert player.wait(START_S) == 2
+    (said,) = player.err.splitlines()
+    assert "player: Invalid topic name" in said
+    assert r"/camera\x1b[2J/image" in said
 
 
 def test_a_torn_bag_plays_what_is_whole_and_says_so(bag, tmp_path):
@@ -243,7 +256,7 @@ def test_an_error_while_playing_is_no_success(bag, stop, monkeypatch):
     def broken(self, *given):
         raise OverflowError("of whatever")
 
-    monkeypatch.setattr(Player, "_publish", broken)
+    monkeypatch.setattr(Player, "_publish_clock", broken)
     with Graph("-p", "wait_for_subscribers:=0") as graph:
         player = graph.add(Player(stop, f"{bag}", context=graph.context))
         graph.until(stop.is_set)

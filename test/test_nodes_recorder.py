@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.serialization import deserialize_message
-from ros_graph import Graph, Process, header, sky, write_bag
+from ros_graph import START_S, Graph, Process, header, sky, write_bag
 from sensor_msgs.msg import Image, PointCloud2, PointField
 from visualization_msgs.msg import MarkerArray
 
@@ -315,7 +315,7 @@ def test_demo_leaves_no_process_behind(tmp_path):
         children = Path(f"/proc/{shown.popen.pid}/task/{shown.popen.pid}/children").read_text()
         assert len(children.split()) == 3
         shown.popen.send_signal(signal.SIGINT)
-        assert shown.wait() == 130
+        assert shown.wait(START_S) == 130
     assert not [pid for pid in children.split() if Path(f"/proc/{pid}").exists()]
     assert "Traceback" not in shown.err
 

@@ -233,7 +233,7 @@ class Observatory:
         self._open.close()
 
     def _start(self, node: str, *arguments: str) -> None:
-        command = [sys.executable, "-m", f"ofsat_ros.nodes.{node}", "--ros-args", *arguments]
+        command = [sys.executable, "-m", "ofsat_ros.nodes.start", node, "--ros-args", *arguments]
         with (self._folder / f"{node}.out").open("w") as out:
             process = subprocess.Popen(command, stdout=out, stderr=out)
         self.nodes[node] = process

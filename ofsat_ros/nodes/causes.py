@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import time
+from typing import Any
 
 # A cause that comes and goes is told of again after so long, s.
 _AGAIN_AFTER_S = 60.0
@@ -47,3 +48,9 @@ class Causes:
         told = self._count if self._said else 0
         self._present, self._count, self._said = "", 0, False
         return told
+
+
+def say_left_out(logger: Any, causes: Causes, topic: str, error: Exception) -> None:
+    """Log that a message on a detector's topic is of no use, whoever has published it."""
+    if causes.wrong(str(error)):
+        logger.warning(f"a message on {topic} is left out, which is not a detector's: {error}")

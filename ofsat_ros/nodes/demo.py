@@ -124,7 +124,6 @@ class _Echo:
 
     def __init__(self, recorder: subprocess.Popen) -> None:
         self._recorder = recorder
-        self._changed = threading.Condition()
         self._lines: list[str] = []
         self._last_s = time.monotonic()
         self._thread = threading.Thread(target=self._read, daemon=True)
@@ -133,20 +132,17 @@ class _Echo:
     def _read(self) -> None:
         for line in self._recorder.stdout:
             print(line, end="", flush=True)
-            with self._changed:
-                self._lines.append(line.strip())
-                self._last_s = time.monotonic()
-                self._changed.notify_all()
+            self._lines.append(line.strip())
+            self._last_s = time.monotonic()
 
     def wait_for(self, wanted: str, *others: subprocess.Popen) -> None:
         """Wait for a line; raise if a process ends before."""
         deadline_s = time.monotonic() + _START_S
-        with self._changed:
-            while wanted not in self._lines:
-                ended = [p for p in (self._recorder, *others) if p.poll() is not None]
-                if ended or time.monotonic() > deadline_s:
-                    raise DemoError("the nodes did not start; see above")
-                self._changed.wait(0.1)
+        while wanted not in self._lines:
+            ended = [p for p in (self._recorder, *others) if p.poll() is not None]
+            if ended or time.monotonic() > deadline_s:
+                raise DemoError("the nodes did not start; see above")
+            time.sleep(0.05)
 
     def wait_for_end(self, player: subprocess.Popen, detector: subprocess.Popen) -> None:
         """Wait until the recorder has all frames, or nothing happens any more."""
@@ -170,7 +166,3 @@ def _sum_up(output: Path, count: int) -> int:
         f" the files are in {output}"
     )
     return 0 if answered == count else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())

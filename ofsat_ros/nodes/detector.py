@@ -8,7 +8,6 @@ may wait for ``backlog_s``, and then only the newest is.  Topics, fields and uni
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 import traceback
@@ -49,6 +48,7 @@ from ofsat_ros.parameters import (
     Table,
 )
 from ofsat_ros.pipeline import FrameResult, ImageError, Pipeline
+from ofsat_ros.printing import printable
 from ofsat_ros.tracking import TRACK_DTYPE
 
 # Results are small; a subscriber may be this far behind and lose none.
@@ -273,7 +273,7 @@ class Detector(Node):
     def _look_around(self) -> Around:
         publishers = self.count_publishers(self._images.topic_name)
         infos = self.get_publishers_info_by_topic(self._detections.topic_name)
-        nodes = [f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in infos]
+        nodes = [printable(f"{i.node_namespace.rstrip('/')}/{i.node_name}") for i in infos]
         if (own := self.get_fully_qualified_name()) in nodes:
             nodes.remove(own)
         return Around(publishers, [] if publishers else self._other_image_topics(), nodes)
@@ -287,7 +287,7 @@ class Detector(Node):
         """Topics with images that somebody else publishes: perhaps the camera's."""
         kind = "sensor_msgs/msg/" + self._images.msg_type.__name__
         return [
-            name
+            printable(name)
             for name, kinds in self.get_topic_names_and_types()
             if kind in kinds and name != self._annotated.topic_name and self.count_publishers(name)
         ]
@@ -300,6 +300,8 @@ class Detector(Node):
             "stuck": stuck,
             "silence": "" if stuck else self._health.silence(timeout_s),
             "rivals": self._health.rivalry(),
+            "losses": self._health.losses(),
+            "lateness": self._health.lateness(timeout_s),
         }
         for kind, words in problems.items():
             if words and kind not in self._said:
@@ -307,8 +309,6 @@ class Detector(Node):
         if "silence" in self._said and self._health.silence_s() <= timeout_s:
             self.get_logger().info(f"images come again on {self._images.topic_name}")
         self._said = {kind for kind, words in problems.items() if words}
-        if losses := self._health.losses():
-            self.get_logger().warning(losses, throttle_duration_sec=_WARN_EVERY_S)
 
 
 def _check_header(header: Header) -> None:
@@ -327,7 +327,3 @@ def main() -> int:
         lambda stop, options: Detector(),
         parser_of("detector", "Detect satellites in a camera's images."),
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -105,5 +105,12 @@ class Heartbeat:
                     self._logger.error(traceback.format_exc(), throttle_duration_sec=_WARN_EVERY_S)
 
 
+def nobody_publishes(node: Node, topic: str) -> str:
+    """Return what a node says that waits for a detector's topic; empty if somebody sends it."""
+    if node.count_publishers(topic):
+        return ""
+    return f"nobody publishes {topic}: is the detector running?"
+
+
 def _text(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -8,8 +8,8 @@ signs, units and what the mount must do itself: docs/integration.md.
 from __future__ import annotations
 
 import math
-import sys
 import threading
+import time
 
 import numpy as np
 from geometry_msgs.msg import TwistStamped, Vector3Stamped
@@ -23,7 +23,8 @@ from std_srvs.srv import SetBool
 from ofsat_ros.camera import Astrometry, Camera, CameraError
 from ofsat_ros.guidance import Command, Guide
 from ofsat_ros.nodes import messages
-from ofsat_ros.nodes.diagnostics import Diagnostics
+from ofsat_ros.nodes.causes import Causes, say_left_out
+from ofsat_ros.nodes.diagnostics import Diagnostics, nobody_publishes
 from ofsat_ros.nodes.ros_parameters import NodeParameters
 from ofsat_ros.nodes.runtime import (
     hear_camera_info,
@@ -37,7 +38,8 @@ from ofsat_ros.parameters import CameraParameters, GuideParameters, Table
 
 # A frame's tracks that come late are of use only if nothing newer has come.
 _DEPTH = 10
-_WARN_EVERY_S = 10.0
+# s; a state that comes and goes is told of again after so long.
+_AGAIN_AFTER_S = 10.0
 _NS = 1_000_000_000
 # What an engaged guide should be doing.
 _GOOD_STATES = ("following", "disengaged")
@@ -71,8 +73,11 @@ class GuideNode(Node):
         self._frames = self._commands = 0
         self._lag_s = math.nan  # of the newest frame, when it came
         self._command: Command | None = None
-        self._said = ""
+        self._said = ""  # state and target that the diagnostics tell
+        self._told, self._told_at_s = "", {}  # those that the log tells, and when each was told
+        self._lag_is_told = False
         self._without_sight = False
+        self._foreign = Causes()  # of messages that are left out
         # Commands and close() come from two threads.
         self._lock = threading.Lock()
         self._closed = False
@@ -139,12 +144,9 @@ class GuideNode(Node):
             tracks = messages.tracks_array(cloud)
         # Whatever others publish under this name must not end what guides a mount.
         except messages.MessageError as error:
-            self.get_logger().warning(
-                f"a message on {self._tracks.topic_name} is left out, which is not a detector's:"
-                f" {error}",
-                throttle_duration_sec=_WARN_EVERY_S,
-            )
+            say_left_out(self.get_logger(), self._foreign, self._tracks.topic_name, error)
             return
+        self._foreign.right()
         middle_ns = self._astrometry.middle_ns(messages.stamp_ns(cloud.header.stamp))
         self._lag_s = (self._now_ns() - middle_ns) / _NS
         self._frame_id = cloud.header.frame_id
@@ -198,11 +200,16 @@ class GuideNode(Node):
         return self.get_clock().now().nanoseconds
 
     def _say_aloud(self, command: Command) -> None:
-        """Log what changes, and tell it in the diagnostics at once."""
+        """Tell in the diagnostics at once what changes; log it, though not at each flicker."""
         what = f"{command.state} {command.target_id}"
+        now_s = time.monotonic()
+        last_s = self._told_at_s.get(what, -math.inf)
+        if what != self._told and now_s - last_s >= _AGAIN_AFTER_S:
+            recent = {w: at for w, at in self._told_at_s.items() if now_s - at < _AGAIN_AFTER_S}
+            self._told, self._told_at_s = what, recent | {what: now_s}
+            self.get_logger().info(command.reason)
         if what != self._said:
             self._said = what
-            self.get_logger().info(command.reason)
             self._publish_diagnostics()
 
     def _publish_diagnostics(self) -> None:
@@ -225,19 +232,29 @@ class GuideNode(Node):
                 "the detector gives no lines of sight: does it hear the same camera_info, and is"
                 " that one of its images' size?"
             )
-        if not self.count_publishers(self._tracks.topic_name):
-            errors.append(f"nobody publishes {self._tracks.topic_name}: is the detector running?")
-        if abs(self._lag_s) > own.stale_after_s:
-            where = "behind" if self._lag_s > 0 else "ahead of"
-            errors.append(
-                f"frames are stamped {abs(self._lag_s):.1f} s {where} this node's clock: check"
-                " use_sim_time, stamp_offset_s, the machines' clocks, and that the sender keeps up"
-            )
-            self.get_logger().warning(errors[-1], throttle_duration_sec=_WARN_EVERY_S)
+        if nobody := nobody_publishes(self, self._tracks.topic_name):
+            errors.append(nobody)
+        elif lag := self._lag_in_words(own.stale_after_s):
+            errors.append(lag)
         others = self.count_publishers(self._mount_rate.topic_name) - 1
         if others > 0 and command is not None and command.commanding:
             warnings.append(f"{others} more publish {self._mount_rate.topic_name}")
         return errors, warnings
+
+    def _lag_in_words(self, stale_after_s: float) -> str:
+        """Return what to say of frames that are too old or of the future; log when it begins."""
+        lags = abs(self._lag_s) > stale_after_s
+        began, self._lag_is_told = lags and not self._lag_is_told, lags
+        if not lags:
+            return ""
+        words = (
+            f"frames are stamped {abs(self._lag_s):.1f} s"
+            f" {'behind' if self._lag_s > 0 else 'ahead of'} this node's clock: check"
+            " use_sim_time, stamp_offset_s, the machines' clocks, and that the sender keeps up"
+        )
+        if began:
+            self.get_logger().warning(words)
+        return words
 
     def _values(self, command: Command | None) -> dict[str, object]:
         if command is None:
@@ -276,7 +293,3 @@ def main() -> int:
         lambda stop, options: GuideNode(),
         parser_of("guide", "Keep a mount on a satellite that the detector tracks."),
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

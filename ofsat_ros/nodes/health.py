@@ -27,6 +27,8 @@ _RECENT_S = 10.0
 _FRAMES_IN_RATE = 200
 # A torn frame or two are none of the node's; so many in a row are.
 _FAILING = 3
+# The middleware drops what it cannot read, and does not tell it from what did not come.
+_OR_TORN = "; or, if it is one now and then, the sender's messages are torn"
 # s; a stage's time is its mean over it, or that of the last frame.
 _PROFILE_S = 1.0
 
@@ -208,6 +210,20 @@ class Health:
             " mixed; give each camera a topic and a detector of its own"
         )
 
+    def lateness(self, timeout_s: float) -> str:
+        """Return what to say when images are answered so long after they came; else empty."""
+        with self._lock:
+            late = self._latency_s > timeout_s
+            # Of the last image before a silence nothing more is to be done.
+            late = late and time.monotonic() - self._processed_at[-1] <= _RECENT_S
+            latency_s = self._latency_s
+        if not late:
+            return ""
+        return (
+            f"answers come {latency_s:.0f} s after their images, which come faster than they are"
+            " processed: slow the sender down, bin the images, or raise threshold_sigmas"
+        )
+
     def losses(self) -> str:
         """Return what to say about frames lost a short while ago; empty if there are none."""
         if time.monotonic() - self._last_loss_s > _RECENT_S:
@@ -216,9 +232,9 @@ class Health:
         if self._reliable:
             return (
                 f"at least {lost} frames lost: they come faster than they are processed; slow the"
-                " sender down, or raise queue_depth"
+                f" sender down, or raise queue_depth{_OR_TORN}"
             )
-        return f"at least {lost} frames lost on the way: {self._remedy_at_sender()}"
+        return f"at least {lost} frames lost on the way: {self._remedy_at_sender()}{_OR_TORN}"
 
     def problems(self, timeout_s: float, in_work_s: float = 0.0) -> tuple[list[str], list[str]]:
         """Return what is wrong now, in words.
@@ -257,6 +273,7 @@ class Health:
             self.rivalry(),
             self.mixture(),
             self.losses(),
+            self.lateness(timeout_s),
             f"slower than the camera: {self._counts['dropped']} frames dropped" if drops else "",
             failed if failures < _FAILING else "",
             f"nothing is seen: {result.reason}" if result and not len(result.objects) else "",

@@ -10,7 +10,6 @@ are on their way to it: replay then slows down instead of losing frames.
 from __future__ import annotations
 
 import math
-import sys
 import threading
 import time
 from collections import deque
@@ -35,6 +34,7 @@ from ofsat_ros.nodes.runtime import (
     run,
 )
 from ofsat_ros.parameters import PlayerParameters
+from ofsat_ros.printing import printable
 from ofsat_ros.recordings import (
     ATTITUDE,
     CAMERA_INFO,
@@ -100,7 +100,7 @@ class Player(Node):
         own = self._settings[PlayerParameters]
         self._bag = _open(bag or own.bag)
         for problem in self._bag.problems:
-            self.get_logger().warning(problem)
+            self.get_logger().warning(printable(problem))
         topics = _image_topics(self._bag, own.topic)
         self._publishers_of = {name: self._publisher(name) for name in topics}
         self._beside = {
@@ -156,7 +156,7 @@ class Player(Node):
                     self._play()
                     again = self._settings[PlayerParameters].loop
             except RecordingError as error:
-                self.get_logger().error(str(error))
+                self.get_logger().error(printable(str(error)))
                 self.exit_code = 1
             self._finish()
 
@@ -192,6 +192,9 @@ class Player(Node):
             last_ns = time_ns
             if self._stop.is_set():
                 break
+            stamp = self._stamp_ns(topic, time_ns, data)
+            if stamp is None:
+                continue
             if topic in self._beside:
                 self._beside[topic].publish(bytes(data))
                 beside += 1
@@ -201,7 +204,11 @@ class Player(Node):
             self._wait_for_answers(_UNANSWERED - 1)
             if self._stop.is_set():
                 break
-            count += self._publish(topic, time_ns, data)
+            self._publish_clock(time_ns)
+            with self._answered:
+                self._unanswered.append(stamp)
+            self._publishers_of[topic].publish(bytes(data))
+            count += 1
             if count % _DEPTH == 0:
                 self._wait_for_receipt()
         skipped = f"; {self._truncated} truncated ones skipped" if self._truncated else ""
@@ -218,7 +225,8 @@ class Player(Node):
         for topic, _, time_ns, data in self._bag.messages(topics):
             if time_ns >= start_ns or self._stop.is_set():
                 break
-            last[topic] = bytes(data)
+            if self._stamp_ns(topic, time_ns, data) is not None:
+                last[topic] = bytes(data)
         for topic, data in last.items():
             self._beside[topic].publish(data)
         return len(last)
@@ -245,21 +253,19 @@ class Player(Node):
             self._stop.wait(min(next_s - now_s, _CLOCK_PERIOD_S))
         return due_s
 
-    def _publish(self, topic: str, time_ns: int, data: bytes | memoryview) -> bool:
-        """Publish an image; return False if it ends within its header, and so is none."""
-        self._publish_clock(time_ns)
+    def _stamp_ns(self, topic: str, time_ns: int, data: bytes | memoryview) -> int | None:
+        """Return a message's stamp; None if it ends before that, and is not to be sent.
+
+        An empty one would be asked for again by the middleware, which waits with all that follow.
+        """
         try:
-            stamp = messages.header_stamp_ns(data)
+            return messages.header_stamp_ns(data)
         except messages.MessageError as error:
             self._truncated += 1
             self.get_logger().warning(
                 f"{topic}: a message at {time_ns} ns is skipped: {error}", once=True
             )
-            return False
-        with self._answered:
-            self._unanswered.append(stamp)
-        self._publishers_of[topic].publish(bytes(data))
-        return True
+            return None
 
     def _publish_clock(self, time_ns: int) -> None:
         self._clock_at_s = time.monotonic()
@@ -333,7 +339,3 @@ def main() -> int:
     parser = parser_of("player", "Play the images of a bag.")
     parser.add_argument("bag", nargs="?", default="", help="a bag's folder, .mcap, .db3 or .bag")
     return run(lambda stop, options: Player(stop, options.bag), parser)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

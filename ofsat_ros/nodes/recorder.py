@@ -27,7 +27,8 @@ from visualization_msgs.msg import MarkerArray
 
 from ofsat_ros.images import encode_png
 from ofsat_ros.nodes import messages
-from ofsat_ros.nodes.diagnostics import Diagnostics
+from ofsat_ros.nodes.causes import Causes, say_left_out
+from ofsat_ros.nodes.diagnostics import Diagnostics, nobody_publishes
 from ofsat_ros.nodes.ros_parameters import NodeParameters
 from ofsat_ros.nodes.runtime import (
     StartError,
@@ -50,7 +51,6 @@ HEARING = "hearing a detector"  # printed as soon as this is so
 _DEPTH = 1000
 # Pictures that come while one is written: none that is wanted may be lost.
 _PICTURES_DEPTH = 20
-_WARN_EVERY_S = 10.0
 # Consecutive frames without detection that share one line of the table.
 _QUIET_FRAMES = 10
 # Of a disk; a night of results without pictures takes less.
@@ -103,6 +103,7 @@ class Recorder(Node):
         self._recent: deque[tuple[int, int]] = deque(maxlen=_DEPTH)  # stamp, frame
         self._last_frame_s = math.inf
         self._hears = False
+        self._foreign = Causes()  # of messages that are left out
         # Callbacks and close() come from two threads.
         self._lock = threading.Lock()
         self._closed = False
@@ -158,20 +159,19 @@ class Recorder(Node):
         try:
             if not self.exit_code:
                 take(data, info["publication_sequence_number"])
+                self._foreign.right()
         except (OSError, RecordingError) as error:
             self._give_up(error)
         # Whatever others publish under these names must not end the recording.
         except Exception as error:  # noqa: BLE001
-            self.get_logger().warning(
-                f"a message on {topic} is left out, which is not a detector's: {error}",
-                throttle_duration_sec=_WARN_EVERY_S,
-            )
+            say_left_out(self.get_logger(), self._foreign, topic, error)
 
     def _give_up(self, error: Exception) -> None:
         """End, since a file cannot be written; say the first reason."""
         if not self.exit_code:
             self.exit_code = 1
-            say(f"recorder: the recording in {self._folder} ends: {error}", sys.stderr)
+            why = getattr(error, "strerror", None) or error
+            say(f"recorder: the recording in {self._folder} ends: {why}", sys.stderr)
         self._stop.set()
 
     def _on_detections(self, data: bytes, sequence: int) -> None:
@@ -215,10 +215,16 @@ class Recorder(Node):
         if frame is None or frame % self._own.picture_every:
             return
         png = encode_png(messages.picture_array(deserialize_message(data, Image)))
+        path = self._folder / PICTURE.format(frame)
         with self._lock:
-            if not self._closed:
-                (self._folder / PICTURE.format(frame)).write_bytes(png)
-                self._pictures += 1
+            if self._closed:
+                return
+            try:
+                path.write_bytes(png)
+            except OSError:  # no torn picture stays
+                path.unlink(missing_ok=True)
+                raise
+            self._pictures += 1
 
     def _write(self, topic: str, msgtype: str, data: bytes, stamp: int) -> None:
         """Write into the bag, at the image's time: it then plays beside the recording."""
@@ -240,8 +246,8 @@ class Recorder(Node):
 
     def _publish_diagnostics(self) -> None:
         errors, warnings, free = [], [], math.nan
-        if not self.count_publishers(self._cloud_topic):
-            errors.append(f"nobody publishes {self._cloud_topic}: is the detector running?")
+        if nobody := nobody_publishes(self, self._cloud_topic):
+            errors.append(nobody)
         try:
             free = float(shutil.disk_usage(self._folder).free)
         except OSError as error:
@@ -352,7 +358,3 @@ def main() -> int:
         lambda stop, options: Recorder(stop),
         parser_of("recorder", "Print and record what a detector finds."),
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -26,7 +26,7 @@ from typing import Any, NoReturn, TextIO
 
 import rclpy
 from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
-from rclpy.exceptions import ParameterException
+from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
@@ -39,6 +39,7 @@ from ofsat_ros.nodes import shared_memory
 from ofsat_ros.nodes.ros_parameters import refuse_unknown
 from ofsat_ros.nodes.start import END_SIGNALS
 from ofsat_ros.parameters import ParameterError
+from ofsat_ros.printing import printable
 
 STARTED_WRONGLY = 2  # exit code; the same as argparse's
 
@@ -206,8 +207,14 @@ def run(
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         node = make_node(stop, options)
         refuse_unknown(node)
-    # rclpy's own: use_sim_time or a QoS of the wrong type.
-    except (ParameterError, ParameterException, StartError, RuntimeError) as error:
+    # rclpy's own: use_sim_time or a QoS of the wrong type; a recorded topic that is no name.
+    except (
+        ParameterError,
+        ParameterException,
+        NameValidationException,
+        StartError,
+        RuntimeError,
+    ) as error:
         say(f"{parser.prog}: {_one_line(error)}", sys.stderr)
         if node is not None:
             node.close()
@@ -344,7 +351,7 @@ def _serve(node: Node, stop: threading.Event) -> NoReturn:
 
 
 def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
+    return printable(" ".join(str(error).split()))
 
 
 def _keep_large_buffers() -> None:

@@ -14,7 +14,6 @@ measured in real time lasts `rate` times as long for it, as does a guide's pause
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 from collections import deque
@@ -38,9 +37,10 @@ from ofsat_ros.simulation import SimulatedFrame, SimulatedMount, SphereSimulator
 
 _FRAME_ID = "camera_optical_frame"
 _DEPTH = 10
-_WARN_EVERY_S = 10.0
 # A machine that cannot keep up renders late, not in bursts: by so much it may fall behind.
 _MOST_BEHIND_S = 0.2
+# s; what is not worth a word.
+_LITTLE_BEHIND_S = 0.5
 
 
 class Simulator(Node):
@@ -77,7 +77,7 @@ class Simulator(Node):
         self._attitude = self._publisher(QuaternionStamped, "attitude")
         self._truth = self._publisher(PointCloud2, "rso_truth")
         self._begun_s = time.monotonic()
-        self._behind_s = 0.0
+        self._behind_s, self._say_behind_s = 0.0, _LITTLE_BEHIND_S
         self._mount: SimulatedMount | None = None
         if isinstance(self._sky, SphereSimulator) and isinstance(self._sky.motion, SimulatedMount):
             self._mount = self._sky.motion
@@ -129,20 +129,25 @@ class Simulator(Node):
                 due_s = number * settings.period_s + settings.exposure_s
                 late_s = (self._now_s() - due_s) / own.rate
                 if late_s > _MOST_BEHIND_S:
-                    self._begun_s += late_s - _MOST_BEHIND_S
-                    self._behind_s += late_s - _MOST_BEHIND_S
-                    self.get_logger().warning(
-                        "this machine renders slower than the camera exposes: stamps are"
-                        f" {self._behind_s:.1f} s behind the clock; lower the rate, or use fewer"
-                        " or smaller frames",
-                        throttle_duration_sec=_WARN_EVERY_S,
-                    )
+                    self._fall_behind(late_s - _MOST_BEHIND_S)
                 self._stop.wait(max(0.0, -late_s))
                 if self._stop.is_set():
                     return
                 self._publish(self._render())
                 number += 1
             self._images.wait_for_all_acked(Duration(seconds=10))
+
+    def _fall_behind(self, seconds: float) -> None:
+        """Have stamps stay behind the clock by so much more; say so whenever it has doubled."""
+        self._begun_s += seconds
+        self._behind_s += seconds
+        if self._behind_s >= self._say_behind_s:
+            self._say_behind_s = 2 * self._behind_s
+            self.get_logger().warning(
+                "this machine renders slower than the camera exposes: stamps are"
+                f" {self._behind_s:.1f} s behind the clock; lower the rate, or use fewer or"
+                " smaller frames"
+            )
 
     def _render(self) -> SimulatedFrame:
         if self._mount is not None:
@@ -208,7 +213,3 @@ def main() -> int:
         lambda stop, options: Simulator(stop),
         parser_of("simulator", "Simulate a telescope camera."),
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -20,6 +20,7 @@ from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.causes import Causes
 from ofsat_ros.nodes.runtime import hear_camera_info, overridable_qos
 from ofsat_ros.parameters import CameraParameters
+from ofsat_ros.printing import printable
 
 # Small messages, of which one thread may be late in taking many.
 _DEPTH = 1000
@@ -61,7 +62,7 @@ class Sky:
         if self._info is not None or self._node.count_publishers(topic):
             return
         found = [
-            name
+            printable(name)
             for name, kinds in self._node.get_topic_names_and_types()
             if "sensor_msgs/msg/CameraInfo" in kinds and self._node.count_publishers(name)
         ]

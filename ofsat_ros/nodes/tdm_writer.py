@@ -27,7 +27,8 @@ from sensor_msgs.msg import PointCloud2
 
 from ofsat_ros.camera import Astrometry
 from ofsat_ros.nodes import messages
-from ofsat_ros.nodes.diagnostics import Diagnostics
+from ofsat_ros.nodes.causes import Causes, say_left_out
+from ofsat_ros.nodes.diagnostics import Diagnostics, nobody_publishes
 from ofsat_ros.nodes.ros_parameters import NodeParameters
 from ofsat_ros.nodes.runtime import (
     StartError,
@@ -48,7 +49,6 @@ from ofsat_ros.timeline import AstrayError, Timeline
 from ofsat_ros.tracking_data import SUFFIXES, Arc, TrackArcs, remove_parts, write_arcs
 
 _DEPTH = 1000  # detections of so many frames may wait to be taken
-_WARN_EVERY_S = 10.0
 _RETRY_S = 10.0
 _LAST_WRITES_S = 5.0  # patience at the end with a disk that hangs
 # No more images come when nothing was heard for so many times what lay between the last two
@@ -107,6 +107,7 @@ class TdmWriter(Node):
         self._waiting: list[Arc] = []  # ended, and not yet written
         self._counts: Counter[str] = Counter()
         self._why_waiting = ""
+        self._foreign = Causes()  # of messages that are left out
         # Callbacks, close() and the thread that writes share what stands above.
         self._lock = threading.Lock()
         self._to_write = threading.Event()
@@ -163,11 +164,9 @@ class TdmWriter(Node):
         try:
             rows = messages.detections_array(cloud)
         except messages.MessageError as error:
-            self.get_logger().warning(
-                f"a message is left out, which is not a detector's: {error}",
-                throttle_duration_sec=_WARN_EVERY_S,
-            )
+            say_left_out(self.get_logger(), self._foreign, self._topic, error)
             return
+        self._foreign.right()
         with self._lock:
             if self._closed:
                 return
@@ -247,8 +246,8 @@ class TdmWriter(Node):
             counts, waiting, why = self._counts.copy(), len(self._waiting), self._why_waiting
             errors = [f"{_in_words(waiting)} waiting: {why}"] if waiting else []
             warnings = [_NO_DIRECTIONS] if self._only_without_direction() else []
-        if not self.count_publishers(self._topic):
-            errors.append(f"nobody publishes {self._topic}: is the detector running?")
+        if nobody := nobody_publishes(self, self._topic):
+            errors.append(nobody)
         values = {
             "tracks_written": counts["tracks"],
             "tracks_waiting": waiting,
@@ -297,7 +296,3 @@ def main() -> int:
         lambda stop, options: TdmWriter(stop),
         parser_of("tdm_writer", "Write the directions of tracks for orbit determination."),
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -106,12 +106,19 @@ class Watch(Node):
             self._board.publishers(nodes, elsewhere)
 
     def _show(self) -> None:
-        with lifetime(self, self._stop), _Screen(self._out) as screen:
-            while not self._closed.wait(_PERIOD_S):
-                size = shutil.get_terminal_size()
-                with self._lock:
-                    lines = self._board.lines(size.columns, size.lines)
-                screen.show(lines)
+        with lifetime(self, self._stop):
+            try:
+                with _Screen(self._out) as screen:
+                    self._refresh(screen)
+            except OSError:  # the terminal is gone, and with it whom to tell
+                self.exit_code = 1
+
+    def _refresh(self, screen: _Screen) -> None:
+        while not self._closed.wait(_PERIOD_S):
+            size = shutil.get_terminal_size()
+            with self._lock:
+                lines = self._board.lines(size.columns, size.lines)
+            screen.show(lines)
 
 
 class _Screen:
@@ -151,7 +158,3 @@ def main() -> int:
         lambda stop, options: Watch(stop, _terminal()),
         parser_of("watch", "Show tracks and health of a running detector on a terminal."),
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())
