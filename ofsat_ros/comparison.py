@@ -21,8 +21,9 @@ Array = NDArray[np.float64]
 _PREPROCESSING = [p.name for p in Parameters.describe() if p.stage == "preprocessing"]
 # What of an object noise and clouds hardly show.
 _CLEAR_SNR = 7.0
-# So many clear objects are a star field that another frame of it would show, too.
-_FEW_STARS = 3
+# So many clear objects are a star field that another frame of it would show, too; and so many
+# would show how it moves, whatever else is among them.
+_FEW_STARS, _MANY_STARS = 3, 10
 # A place on an object is its place if it is as near as this to its centroid, px and in lengths.
 _ON_PX, _ON_SHARE = 3.0, 0.25
 # A track is as near as this to where it is expected if the field goes on as it did, px.
@@ -62,6 +63,10 @@ class Seen:
     def clear(self) -> NDArray[np.bool_]:
         """Which objects are clear ones, (N,)."""
         return self.objects["snr"] >= _CLEAR_SNR
+
+    def shows_as_much_as(self, other: Seen | None) -> bool:
+        """Whether it has no fewer clear objects than another frame."""
+        return other is None or bool(self.clear.sum() >= other.clear.sum())
 
 
 def why_not_comparable(before: Seen, now: Seen) -> str:
@@ -114,11 +119,25 @@ def find_motion(
     before: Seen,
     now: Seen,
     expected: StarFieldMotion | None,
+    doubted: StarFieldMotion | None,
     parameters: Parameters,
-) -> StarFieldMotion | None:
-    """Find the field's motion in the flow; None if there is none, or it may well be chance.
+) -> tuple[StarFieldMotion | None, bool]:
+    """Find the field's motion in the flow.
 
-    See `measure_flow` for the parameters; `inliers` of the result are rows of the flow.
+    See `measure_flow` for the parameters.
+
+    Parameters
+    ----------
+    doubted : StarFieldMotion or None
+        Motion between the frames if what frames before showed, and may well have been chance,
+        goes on: where stars are few, seen twice is believed.
+
+    Returns
+    -------
+    motion : StarFieldMotion or None
+        The motion that most vectors share; `inliers` are rows of the flow.
+    believed : bool
+        Whether it is more than chance shows.
     """
     valid = flow.valid
     motion = estimate_motion(
@@ -129,22 +148,24 @@ def find_motion(
         now.flow_input.smoothed.shape,
         parameters.star_field_model,
         parameters.outlier_sigmas,
+        expected,
     )
     if motion is None:
-        return None
+        return None, False
     # As published, the mean is never doubted.
-    doubted = parameters.star_field_model != "mean"
-    if doubted and not _is_shared(motion, before, now, expected):
-        return None
+    believed = parameters.star_field_model == "mean" or _is_shared(motion, before, now, expected)
+    if not believed and expected is None and doubted is not None and motion.is_about(doubted):
+        believed = _is_shared(motion, before, now, doubted)
     inliers = np.zeros(len(flow), bool)
     inliers[valid] = motion.inliers
-    return motion.with_inliers(inliers)
+    return motion.with_inliers(inliers), believed
 
 
-def why_another_field(before: Seen, now: Seen, known: Array) -> str:
+def why_another_field(before: Seen, now: Seen, known: Array, moved: bool) -> str:
     """Say why a frame with no motion from the one before shows another star field.
 
-    Empty if it shows too few stars to be one: they are behind clouds, or there are none.
+    Empty if it shows too few stars to be one: they are behind clouds, or there are none.  Or if
+    stars are few and none has shown how the field moves: they may well be the same.
 
     Parameters
     ----------
@@ -152,12 +173,17 @@ def why_another_field(before: Seen, now: Seen, known: Array) -> str:
         The frames.
     known : (K, 2) float64
         Where tracks are expected, which are no stars, px.
+    moved : bool
+        Whether a motion of the field is known.
     """
     far = ~is_near(now.flow_input.xy, known, now.objects["length"])
-    if np.count_nonzero(now.clear & far) < _FEW_STARS:
+    stars = np.count_nonzero(now.clear & far)
+    if stars < _FEW_STARS:
         return ""
     if np.count_nonzero(before.clear) < _FEW_STARS:
         return "the frame before showed no star field"
+    if stars < _MANY_STARS and not moved:
+        return ""
     return (
         f"the star field jumped: no motion leads from the {len(before.objects)} objects of the"
         f" frame before to the {len(now.objects)} of this one"

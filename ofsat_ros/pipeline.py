@@ -83,8 +83,9 @@ class Pipeline:
         self._settled: list[Settled] = []
         # The smoothed image of a frame that has left the history: fresh memory costs time.
         self._spare: NDArray[np.float32] | None = None
-        # The field's last motion, per second.
+        # The field's last motion, per second, and the last that may have been chance.
         self._field_rate: StarFieldMotion | None = None
+        self._doubted_rate: StarFieldMotion | None = None
         # Where on the sky the previous frame is, and the tracks of the last one, with its stamp.
         self._since: NDArray[np.float64] | None = None
         self._tracks = np.zeros(0, TRACK_DTYPE), 0
@@ -218,7 +219,9 @@ class Pipeline:
             self._forget()
             self._settled.append(Settled(result.frame, stamp_ns, result.detections))
         result.settled, self._settled = self._settled, []
-        if not 0 < self._blind <= _BLIND_FRAMES:
+        # Where no motion is known yet, the frame that shows more is the better one.
+        worse = self._field_rate is not None or not current.shows_as_much_as(self._previous)
+        if not (0 < self._blind <= _BLIND_FRAMES and worse):
             self._previous = current
             self._since = self._history[-1].to_sky if len(self._history) else None
         result.reason = why_nothing(result, image, pre.veiled)
@@ -230,13 +233,18 @@ class Pipeline:
         """Fill in flow, star field and detections; start afresh if it is another field."""
         dt_s = (current.stamp_ns - previous.stamp_ns) / 1e9
         expected = self._field_rate and self._field_rate.over(dt_s)
+        doubted = self._doubted_rate and self._doubted_rate.over(dt_s)
         with _timed(result.seconds, "optical_flow"):
-            flow = measure_flow(previous, current, expected, parameters)
+            flow = measure_flow(previous, current, expected or doubted, parameters)
         with _timed(result.seconds, "star_field"):
-            motion = find_motion(flow, previous, current, expected, parameters)
-        if motion is None:
+            motion, believed = find_motion(flow, previous, current, expected, doubted, parameters)
+        if believed:
+            self._doubted_rate = None
+        else:
+            if motion is not None:
+                self._doubted_rate, motion = motion.over(1 / dt_s), None
             known = self._places_expected(current.stamp_ns)
-            if why := why_another_field(previous, current, known):
+            if why := why_another_field(previous, current, known, expected is not None):
                 self.reset(why)
                 return
         result.dt_s, result.flow, result.star_field = dt_s, flow, motion
@@ -283,8 +291,8 @@ class Pipeline:
             self._forget()
         if motion is not None:
             self._field_rate = motion.over(1 / result.dt_s)
-        elif self._field_rate is not None:
-            motion = self._field_rate.over(result.dt_s)
+        elif rate := self._field_rate or self._doubted_rate:
+            motion = rate.over(result.dt_s)
         to_sky = self._history.place(motion, self._since)
         leaves = self._history[0].smoothed if len(self._history) == self._history.length else None
         # While no stars are seen, frames are compared with one that may have left.

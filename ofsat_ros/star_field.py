@@ -18,8 +18,11 @@ Array = NDArray[np.float64]
 _VOTERS = 150
 # Cells of the coarse vote, along each axis.
 _VOTE_CELLS = 512
-# A similarity has four parameters; with fewer stars than this their scatter goes into them.
-_STARS_FOR_SIMILARITY = 6
+# A similarity has four parameters, and three without scale; with fewer stars than this their
+# scatter goes into them.
+_STARS_FOR_SIMILARITY, _STARS_FOR_TURN = 6, 4
+# Which of them, of shift x, shift y, scale and rotation, are fitted.
+_SHIFT, _TURN, _SIMILARITY = [0, 1], [0, 1, 3], [0, 1, 2, 3]
 # Of so many vectors, this part at least must share a motion that is the field's.
 _MANY_VECTORS, _LEAST_SHARE = 20, 0.1
 # A motion further than this from the expected one, px, needs so many stars, or that part of those
@@ -28,6 +31,8 @@ _OTHER_PX, _ENOUGH_STARS, _ENOUGH_SHARE = 5.0, 5, 0.5
 # A motion is not believed if two unrelated fields show one more often than this; motions so far
 # apart, px, carry objects to different places.
 _MOST_CHANCE, _APART_PX = 1e-2, 1.5
+# A field turns if its rotation is so many of its sigmas.
+_SURE_SIGMAS = 5.0
 # Cut of Tukey's biweight, in sigmas: 95 % efficiency on Gaussian errors.
 _TUKEY = 4.685
 # The fit has converged when no vector of the field changes by more than this, px.
@@ -129,11 +134,9 @@ class StarFieldMotion:
         (Hoeffding 1963, theorem 1).  It has as many tries as there are motions as near to the
         expected one, or pairs of objects that may give one; those that gave it are no evidence.
         """
-        off_px = np.inf
-        if expected is not None:
-            off_px = float(np.hypot(*(self.displacement - expected.displacement)))
-        if off_px <= _OTHER_PX:
-            tries = max(1.0, (off_px / _APART_PX) ** 2)
+        if expected is not None and self.is_about(expected):
+            off_px = np.hypot(*(self.displacement - expected.displacement))
+            tries = max(1.0, float(off_px / _APART_PX) ** 2)
         else:
             if expected is not None and self.star_count < min(
                 _ENOUGH_STARS, _ENOUGH_SHARE * expected.star_count
@@ -145,6 +148,22 @@ class StarFieldMotion:
             tries = float(max(1, objects[0] * objects[1])) ** given
             carried, found = carried - given, found - given
         return bool(np.log(tries) + _log_chance(found, carried, share) < np.log(_MOST_CHANCE))
+
+    @property
+    def turns(self) -> bool:
+        """Whether its rotation is more than an error."""
+        return abs(self.rotation) > _SURE_SIGMAS * float(np.sqrt(self.covariance[3, 3]))
+
+    def turned_with(self, other: StarFieldMotion) -> StarFieldMotion:
+        """Return the same with the rotation of another on top of its own."""
+        covariance = self.covariance.copy()
+        if not covariance[3, 3]:
+            covariance[3, 3] = other.covariance[3, 3]
+        return replace(self, rotation=self.rotation + other.rotation, covariance=covariance)
+
+    def is_about(self, other: StarFieldMotion) -> bool:
+        """Whether it may be another, at the image's centre."""
+        return bool(np.hypot(*(self.displacement - other.displacement)) <= _OTHER_PX)
 
     def displacement_at(self, xy: Array) -> Array:
         """Displacement of the field at points (N, 2) px of the current frame, (N, 2) px."""
@@ -165,6 +184,7 @@ def estimate_motion(
     shape: tuple[int, int],
     model: str = "similarity",
     outlier_sigmas: float = 2.0,
+    expected: StarFieldMotion | None = None,
 ) -> StarFieldMotion | None:
     """Find the motion that most vectors share.
 
@@ -181,6 +201,9 @@ def estimate_motion(
         mean: the mean after outliers of speed are removed, as published (AAS 21-364).
     outlier_sigmas : float
         What the model mean removes, in std.
+    expected : StarFieldMotion, optional
+        The motion if it goes on as it did: the model similarity takes its rotation where stars
+        are too few to show theirs.
 
     Returns
     -------
@@ -193,10 +216,17 @@ def estimate_motion(
     centre = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
     if model == "mean":
         return _mean_motion(displacement, speed, centre, outlier_sigmas)
-    inliers = _mode(displacement, sigma)
+    offset, straight = position - centre, displacement
+    if model != "similarity" or (expected is not None and not expected.turns):
+        expected = None
+    if expected is not None:
+        straight = displacement - expected.rotation * np.stack([-offset[:, 1], offset[:, 0]], 1)
+    inliers = _mode(straight, sigma)
     if len(position) > 1 and np.count_nonzero(inliers) < 2:
         return None
-    motion = _robust_fit(position - centre, displacement, sigma, speed, centre, inliers, model)
+    motion = _robust_fit(offset, straight, sigma, speed, centre, inliers, model)
+    if expected is not None:
+        motion = motion.turned_with(expected)
     few = len(position) >= _MANY_VECTORS and motion.star_count < _LEAST_SHARE * len(position)
     return None if few else motion
 
@@ -324,15 +354,17 @@ def _robust_fit(
     measured, known = displacement.ravel(), (1 / sigma**2).ravel()
     weight = np.where(start, 1.0, 0.0)
     values, covariance = np.zeros(4), np.zeros((4, 4))
-    used, spread = 2, 1.0
+    used, spread = _SHIFT, 1.0
     for _ in range(15):
-        enough = np.count_nonzero(weight) >= _STARS_FOR_SIMILARITY
-        used = 4 if model == "similarity" and enough else 2
-        rows = design[:used]
+        count = np.count_nonzero(weight) if model == "similarity" else 0
+        used = _SHIFT if count < _STARS_FOR_TURN else _TURN
+        if count >= _STARS_FOR_SIMILARITY:
+            used = _SIMILARITY
+        rows = design[used]
         weighted = rows * (np.repeat(weight, 2) * known)
         inverse = np.linalg.pinv(weighted @ rows.T, _LEAST_CONDITION)
         before, values = values, np.zeros(4)
-        values[:used] = inverse @ (weighted @ measured)
+        values[used] = inverse @ (weighted @ measured)
         residual = measured - values @ design
         squares = residual * residual * known
         normal = np.sqrt((squares[::2] + squares[1::2]) / 2)
@@ -342,7 +374,7 @@ def _robust_fit(
         if np.max(np.abs(values - before)) < _CONVERGED_PX or not weight.any():
             break
     units = np.array([1, 1, 1 / size, 1 / size])
-    covariance[:used, :used] = inverse * spread**2
+    covariance[np.ix_(used, used)] = inverse * spread**2
     values, covariance = values * units, covariance * np.outer(units, units)
     inliers = weight > 0
     if not inliers.any():
@@ -358,7 +390,7 @@ def _robust_fit(
         residual_sigmas=spread,
         speed_mean=float(speed[inliers].mean()),
         speed_std=float(speed[inliers].std()),
-        model="similarity" if used == 4 else "shift",
+        model="shift" if used is _SHIFT else "similarity",
     )
 
 

@@ -209,6 +209,19 @@ def test_few_stars_and_as_many_rsos_jump():
             assert result.star_field.displacement == pytest.approx((11, 6), abs=1)
 
 
+def test_two_stars_are_a_field_when_they_show_a_motion_twice(monkeypatch):
+    """Two of four objects may agree by chance, but not on the same motion again."""
+    sky = Sky(0, drifting((3.0, -2.0)))
+    sky.anew, sky.steps = FRAMES, np.array([(-4.0, -2.5), (0.0, 0.0)])
+    stars = np.array([(40.0, 200.0), (190.0, 60.0)]), np.full(2, 2e4)
+    monkeypatch.setattr(Sky, "stars", lambda *_: stars)
+    results = watch(sky)
+    assert [bool(r.reset) for r in results] == [i == 0 for i in range(FRAMES)]
+    for result in results[4:]:
+        assert result.star_field.displacement == pytest.approx((3, -2), abs=0.3)
+        assert_found(sky, result)
+
+
 @pytest.mark.parametrize("px", [3.0, 12.0], ids=["wind", "dither"])
 def test_a_field_that_shakes_is_one_field(px):
     """What is found is found as without: in its third frame, with one id, everywhere."""
