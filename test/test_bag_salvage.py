@@ -114,6 +114,9 @@ def given_or_nothing(path):
 def assert_messages_are_the_original(given):
     assert list(given) == sorted(given)
     for stamp, data in given.items():
+        if data == ORIGINAL[stamp]:
+            continue
+        # Of ROS 1, what is between the fields may differ.
         image = JAZZY.deserialize_cdr(data, IMAGE)
         original = JAZZY.deserialize_cdr(ORIGINAL[stamp], IMAGE)
         np.testing.assert_array_equal(image.data, original.data)

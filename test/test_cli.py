@@ -410,7 +410,7 @@ def test_a_recording_without_a_usable_frame_is_an_error(tmp_path: Path):
 def test_an_empty_sky_says_why_nothing_is_found(tmp_path: Path):
     write(tmp_path / "bag", [np.zeros((64, 64), np.uint16)] * 3)
     done = succeeds("process", tmp_path / "bag", "-o", tmp_path / "out")
-    assert "0 RSO detections in 3 frames; the last frame says: no object is above" in done.stdout
+    assert "0 RSO detections in 3 frames; the last frame says: the image is empty" in done.stdout
 
 
 # Process: what is found
@@ -553,6 +553,34 @@ def test_an_interruption_leaves_whole_files(tmp_path: Path):
     # The signal may also come between two of a frame's messages.
     assert len(counts) == 4
     assert {len(rows) - count for count in counts} <= {0, 1}
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_an_interruption_that_python_drops_is_heard(number, tmp_path: Path, monkeypatch):
+    class Last:
+        def __del__(self):
+            signal.raise_signal(number)  # nothing can be raised here
+
+    usual, hook = Pipeline.process, sys.unraisablehook
+    to_drop = [*range(3), Last()]
+
+    def process(*arguments):
+        del to_drop[:1]
+        time.sleep(0.002)  # or all frames are done first
+        return usual(*arguments)
+
+    monkeypatch.setattr(Pipeline, "process", process)
+    before = {each: signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP)}
+    image = moving(2, 64)
+    write(tmp_path / "bag", [image[i % 2] for i in range(300)])
+    try:
+        said = fails(130, "process", tmp_path / "bag", "-o", tmp_path / "out")
+    finally:
+        for each, handler in before.items():
+            signal.signal(each, handler)
+    assert re.search(r"stopped; .* in \d+ frames?.* so far, in", said)
+    assert 0 < read_run(tmp_path / "out")["frames"] < 300
+    assert sys.unraisablehook is hook
 
 
 def test_an_interruption_leaves_a_whole_bag(tmp_path: Path):

@@ -13,15 +13,14 @@ from __future__ import annotations
 import importlib
 import io
 import keyword
-import signal
 import sys
-import threading
 from typing import Any
 
 import click
 from click.shell_completion import CompletionItem
 
 from ofsat_ros import __version__
+from ofsat_ros.cli.interruption import interruptible, nothing_to_finish
 from ofsat_ros.printing import printable
 
 __all__ = ["main"]
@@ -57,7 +56,8 @@ class _Commands(click.Group):
         if cmd_name not in _COMMANDS:
             return None
         name = f"{cmd_name}_" if keyword.iskeyword(cmd_name) else cmd_name
-        module = importlib.import_module(f"{__name__}.{name}")
+        with nothing_to_finish():
+            module = importlib.import_module(f"{__name__}.{name}")
         command: click.Command = module.command
         return command
 
@@ -75,9 +75,9 @@ class _Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; no mistake of ours gives a traceback that nobody asked for."""
-        _end_as_by_ctrl_c()
         try:
-            return super().invoke(ctx)
+            with interruptible():
+                return super().invoke(ctx)
         except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
             raise  # click knows them
         except ModuleNotFoundError as error:
@@ -101,14 +101,6 @@ class _Commands(click.Group):
                 " ofsat, not in what you did. `ofsat --debug` in place of `ofsat` shows where, for"
                 " your report of it."
             ) from error
-
-
-def _end_as_by_ctrl_c() -> None:
-    if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            # Not what was told to stay: `nohup` means it.
-            if signal.getsignal(number) == signal.SIG_DFL:
-                signal.signal(number, signal.default_int_handler)
 
 
 @click.group(

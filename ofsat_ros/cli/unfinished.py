@@ -94,7 +94,9 @@ class Unfinished:
         # Aside first: to remove a large bag takes a while, to rename it doesn't.
         aside = self.folder / _REPLACED
         aside.mkdir()
-        for name in self._names:
+        # Also what a process that was killed has left half-written beside them.
+        parts = [f".{name}.part" for name in self._names if not name.endswith("/")]
+        for name in [*self._names, *parts]:
             if os.path.lexists(self._place / name):
                 os.replace(self._place / name, aside / name)
         for name in self._names:

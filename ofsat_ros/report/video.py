@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -89,8 +89,13 @@ def write_video(folder: str | Path, path: str | Path, recording: str | Path | No
                     picture = annotate(image, result, tails=tail, footer=footer)
                     show(_sized(picture, side))
         os.replace(unfinished, path)
+    except OSError as error:
+        if error.filename in (None, f"{unfinished}"):  # as of a disk that is full
+            error.filename = f"{path}"
+        raise
     finally:
-        unfinished.unlink(missing_ok=True)
+        with suppress(OSError):  # the folder may be gone
+            unfinished.unlink()
     return path
 
 
