@@ -64,6 +64,11 @@ class Seen:
         """Which objects are clear ones, (N,)."""
         return self.objects["snr"] >= _CLEAR_SNR
 
+    @property
+    def shows_stars(self) -> bool:
+        """Whether it has so many clear objects that some are stars."""
+        return bool(self.clear.sum() >= _FEW_STARS)
+
     def shows_as_much_as(self, other: Seen | None) -> bool:
         """Whether it has no fewer clear objects than another frame."""
         return other is None or bool(self.clear.sum() >= other.clear.sum())
@@ -180,10 +185,11 @@ def why_another_field(before: Seen, now: Seen, known: Array, moved: bool) -> str
     stars = np.count_nonzero(now.clear & far)
     if stars < _FEW_STARS:
         return ""
-    if np.count_nonzero(before.clear) < _FEW_STARS:
-        return "the frame before showed no star field"
-    if stars < _MANY_STARS and not moved:
+    hidden = not before.shows_stars
+    if stars < _MANY_STARS and (hidden or not moved):
         return ""
+    if hidden:
+        return "the frame before showed no star field"
     return (
         f"the star field jumped: no motion leads from the {len(before.objects)} objects of the"
         f" frame before to the {len(now.objects)} of this one"

@@ -90,7 +90,7 @@ class Pipeline:
         self._since: NDArray[np.float64] | None = None
         self._tracks = np.zeros(0, TRACK_DTYPE), 0
         # Frames in a row that show no star field.
-        self._blind = 0
+        self._blind, self._guessing = 0, False
         self._reset_reason = "first frame"
         self._frames = 0
 
@@ -212,6 +212,8 @@ class Pipeline:
         # What shows no stars is no frame to compare with, unless it goes on for long.
         blind = self._previous is not None and (pre.veiled or result.star_field is None)
         self._blind = self._blind + 1 if blind else 0
+        # Where no star was ever seen there is none that could be taken for an RSO.
+        self._guessing = blind and (self._field_rate is not None or current.shows_stars)
         if parameters.rso_test == "history":
             self._remember(pre, regions, result, parameters)
             self._track(pre.defects, result, parameters)
@@ -281,7 +283,7 @@ class Pipeline:
             for frame in old:
                 self._history.add(frame)
         motion, bright = result.star_field, pre.bright
-        if self._blind:
+        if self._guessing:
             # Where it is on the sky is a guess: it goes on with tracks, and shows nothing new.
             y, x = rows_and_columns(bright, result.shape[1])
             known = self._places_expected(result.stamp_ns)
@@ -329,7 +331,7 @@ class Pipeline:
             tracked = self._tracker.update(
                 history,
                 spots,
-                _nothing_new if self._blind else partial(find_drifting, history, log_limit),
+                _nothing_new if self._guessing else partial(find_drifting, history, log_limit),
                 defects,
                 log_limit,
                 parameters.max_speed_px,
