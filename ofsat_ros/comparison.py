@@ -64,10 +64,16 @@ class Seen:
         """Which objects are clear ones, (N,)."""
         return self.objects["snr"] >= _CLEAR_SNR
 
-    @property
-    def shows_stars(self) -> bool:
-        """Whether it has so many clear objects that some are stars."""
-        return bool(self.clear.sum() >= _FEW_STARS)
+    def shows_stars(self, known: Array | None = None) -> bool:
+        """Whether it has enough clear objects, beside known ones (K, 2) px, to call some stars."""
+        return self.stars_beside(known) >= _FEW_STARS
+
+    def stars_beside(self, known: Array | None = None) -> int:
+        """Count the clear objects away from known ones (K, 2) px."""
+        if known is None or not len(known):
+            return int(self.clear.sum())
+        far = ~is_near(self.flow_input.xy, known, self.objects["length"])
+        return int(np.count_nonzero(self.clear & far))
 
     def shows_as_much_as(self, other: Seen | None) -> bool:
         """Whether it has no fewer clear objects than another frame."""
@@ -181,15 +187,13 @@ def why_another_field(before: Seen, now: Seen, known: Array, moved: bool) -> str
     moved : bool
         Whether a motion of the field is known.
     """
-    far = ~is_near(now.flow_input.xy, known, now.objects["length"])
-    stars = np.count_nonzero(now.clear & far)
+    stars = now.stars_beside(known)
     if stars < _FEW_STARS:
         return ""
-    hidden = not before.shows_stars
-    if stars < _MANY_STARS and (hidden or not moved):
-        return ""
-    if hidden:
+    if not len(before.objects) or (not before.shows_stars() and stars >= _MANY_STARS):
         return "the frame before showed no star field"
+    if stars < _MANY_STARS and not (moved and before.shows_stars()):
+        return ""
     return (
         f"the star field jumped: no motion leads from the {len(before.objects)} objects of the"
         f" frame before to the {len(now.objects)} of this one"

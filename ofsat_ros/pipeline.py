@@ -213,7 +213,8 @@ class Pipeline:
         blind = self._previous is not None and (pre.veiled or result.star_field is None)
         self._blind = self._blind + 1 if blind else 0
         # Where no star was ever seen there is none that could be taken for an RSO.
-        self._guessing = blind and (self._field_rate is not None or current.shows_stars)
+        known = self._places_expected(stamp_ns)
+        self._guessing = blind and (self._field_rate is not None or current.shows_stars(known))
         if parameters.rso_test == "history":
             self._remember(pre, regions, result, parameters)
             self._track(pre.defects, result, parameters)
@@ -288,7 +289,7 @@ class Pipeline:
             y, x = rows_and_columns(bright, result.shape[1])
             known = self._places_expected(result.stamp_ns)
             bright = bright[is_near(np.stack([x, y], axis=1).astype(float), known)]
-        if self._blind > _BLIND_FRAMES:
+        if self._guessing and self._blind > _BLIND_FRAMES:
             # Where the stars went meanwhile is not known: what follows is another sky.
             self._forget()
         if motion is not None:

@@ -529,6 +529,7 @@ def test_what_exists_is_not_overwritten(tmp_path):
 def test_force_removes_nothing_but_a_bag(tmp_path):
     folder = tmp_path / "folder"
     folder.mkdir()
+    (folder / "night.mcap").write_text("another recorder's, in a folder of another name")
     with pytest.raises(RecordingError, match="not replaced, since it is no bag"):
         BagWriter(folder, force=True)
     bag = simple_bag(tmp_path / "bag")

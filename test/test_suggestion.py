@@ -229,7 +229,7 @@ SCENES = {
     ),
     "wide": dict(psf_sigma_px=3.0, rsos=rsos(SNRS, np.linspace(2, 8, 8))),
     "few faint stars": dict(
-        star_count=8, star_flux_percent=(10.0, 30.0), rsos=rsos((5, 10, 20), (4, 7, 10))
+        star_count=8, star_flux_percent=(10.0, 30.0), rsos=rsos((3.5, 5, 7), (4, 7, 10))
     ),
     "fast frames": dict(
         **dict(width=256, height=256, frames=20, period_s=0.08, exposure_s=0.08),
@@ -250,7 +250,7 @@ SCENES = {
 GAINS = {
     "sharp": ({"hot_pixels"}, 0.2),
     "wide": ({"smoothing_sigma_px"}, 0.03),
-    "few faint stars": ({"threshold_sigmas"}, 0.05),
+    "few faint stars": ({"threshold_sigmas"}, 0.15),
     "fast frames": ({"history_frames"}, 0.1),
     "fast objects": ({"max_speed_px"}, 0.4),
 }
