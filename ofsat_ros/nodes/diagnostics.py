@@ -7,7 +7,6 @@ node says STALE: that is what an aggregator makes of one that says nothing for s
 
 from __future__ import annotations
 
-import platform
 import threading
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -20,6 +19,7 @@ from rclpy.qos import QoSProfile
 from ofsat_ros.nodes.runtime import overridable_qos
 
 _DEPTH = 100
+_HARDWARE_ID = "ofsat_ros"
 _PERIOD_S = 1.0
 _WARN_EVERY_S = 10.0
 
@@ -63,8 +63,8 @@ class Diagnostics:
             level=level,
             name=self._name,
             message="; ".join([*errors, *warnings]) or summary,
-            # What broke or is busy: the machine; cameras and mounts have no number here.
-            hardware_id=platform.node(),
+            # The same on every machine: a viewer's layout finds a line by name and this.
+            hardware_id=_HARDWARE_ID,
             values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()],
         )
         array = DiagnosticArray(status=[status])
