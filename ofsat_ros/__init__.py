@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Detect satellites and debris in a telescope camera's stream by their optical flow.
 
 Data flows one way; each stage is a module, and a symptom belongs to the stage it names::

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Two frames of a sequence compared: the flow between them, and the motion of the star field.
 
 Stands between the objects of a frame and what the pipeline keeps of many: it leads the optical

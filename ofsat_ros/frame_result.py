@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What one frame gave: the pipeline's answer, and why there is nothing in it.
 
 Stands at the end of the flow: every front, live or offline, shows and writes what is here.

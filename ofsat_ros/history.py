@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """History: the last frames, each with its place on the sky.
 
 Stands between the motion of the star field and detection: chaining the field's motions puts every
@@ -18,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ofsat_ros.pixels import Regions, interpolate
+from ofsat_ros.pixels import Regions, inside, interpolate, positions
 from ofsat_ros.star_field import StarFieldMotion
 
 if TYPE_CHECKING:
@@ -76,6 +77,10 @@ class PastFrame:
     def __post_init__(self) -> None:
         object.__setattr__(self, "from_sky", np.linalg.inv(self.to_sky))
 
+    def seconds_since(self, other: PastFrame) -> float:
+        """Time from another frame to this one, s."""
+        return (self.stamp_ns - other.stamp_ns) / 1e9
+
     @property
     def shape(self) -> tuple[int, int]:
         """Height and width, px."""
@@ -84,7 +89,7 @@ class PastFrame:
     @cached_property
     def object_sky(self) -> Array:
         """The objects' centroids in the sky plane, (N, 2)."""
-        return self.sky(np.stack([self.objects["x"], self.objects["y"]], axis=1))
+        return self.sky(positions(self.objects))
 
     @cached_property
     def object_light(self) -> Array:
@@ -109,10 +114,7 @@ class PastFrame:
 
     def contains(self, xy: Array, margin: float = 0.0) -> NDArray[np.bool_]:
         """Whether points (N, 2) px are at least `margin` px inside the image, (N,)."""
-        height, width = self.shape
-        x, y = xy[:, 0], xy[:, 1]
-        across = (x >= margin) & (x <= width - 1 - margin)
-        return across & (y >= margin) & (y <= height - 1 - margin)
+        return inside(xy, self.shape, margin)
 
     def light_at(self, xy: Array) -> Array:
         """Brightness of `smoothed` at points (N, 2) px, by cubic interpolation, (N,) DN."""

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Bytes of a recorded or received image -> array: the only place that knows image encodings.
 
 It stands before the pipeline, which takes 2-D arrays only: ``recordings`` (offline) and ``nodes``

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Objects: one measurement per connected region of the thresholded image.
 
 Second stage: takes what ``preprocessing`` found above the threshold; what follows measures the
@@ -10,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ofsat_ros.pixels import Regions, connected, rows_and_columns
+from ofsat_ros.pixels import Regions, connected, rows_and_columns, streak_of
 
 Index = NDArray[np.intp]
 
@@ -95,12 +96,8 @@ def find_objects(
     region, pixels, values = region[large], pixels[large], values[large]
     light = smoothed.ravel()[pixels]
     region, count = _split(region, count, pixels, light, smoothed, noise)
-    # What lies between the parts of a split region belongs to none.
-    inside = region >= 0
+    inside, region, count = _renumbered(region, count)
     pixels, raw, light = pixels[inside], values[inside].astype(np.float64), light[inside]
-    # A part may be left without a pixel.
-    present = np.bincount(region[inside], minlength=count) > 0
-    region, count = (np.cumsum(present) - 1)[region[inside]], int(np.count_nonzero(present))
     y, x = rows_and_columns(pixels, shape[1])
     moments = _moments(region, count, x, y, light.astype(np.float64), noise)
 
@@ -111,23 +108,37 @@ def find_objects(
     local = _sample_mesh(noise_ratio, moments["x"], moments["y"], shape)
     energy = total(raw * raw) / (pixel_noise * local) ** 2 - area
     snr = np.maximum(moments["peak"] / (noise * local), np.sqrt(np.maximum(energy, 0)))
-    order = np.flatnonzero(area >= min_area_px)
-    order = order[np.argsort(-snr[order], kind="stable")][:max_objects]
     objects = np.zeros(count, OBJECT_DTYPE)
     objects["flux"], objects["snr"], objects["area"] = total(raw), snr, area
     for name in ("x", "y", "peak"):
         objects[name] = moments[name]
     for name, moment in (("sigma_x", moments["xx"]), ("sigma_y", moments["yy"])):
         objects[name] = np.sqrt(2 * moment * moments["untruncated"]) / np.maximum(snr, 1)
-    objects["length"], objects["angle"] = _streak(moments, snr)
+    objects["length"], objects["angle"] = streak_of(
+        moments["xx"], moments["yy"], moments["xy"], snr
+    )
     at_border = (x == 0) | (y == 0) | (x == shape[1] - 1) | (y == shape[0] - 1)
     if blind is not None:
         at_border |= blind[y, x]
     objects["edge"][region[at_border]] = True
+    order = np.flatnonzero(area >= min_area_px)
+    order = order[np.argsort(-snr[order], kind="stable")][:max_objects]
     owner = np.full(count, -1)
     owner[order] = np.arange(order.size)
     owner = owner[region]
     return objects[order], Regions(shape, pixels[owner >= 0], owner[owner >= 0])
+
+
+def _renumbered(region: Index, count: int) -> tuple[NDArray[np.bool_], Index, int]:
+    """Which pixels are in a region, (M,), the regions of these without gaps, and how many.
+
+    What lies between the parts of a split region is in none, and a part may be left without a
+    pixel.
+    """
+    inside = region >= 0
+    region = region[inside]
+    present = np.bincount(region, minlength=count) > 0
+    return inside, (np.cumsum(present) - 1)[region], int(np.count_nonzero(present))
 
 
 def _split(
@@ -306,20 +317,6 @@ def _moments(
         "peak": peak,
         "untruncated": _untruncated(lowest / np.maximum(peak, 1e-9)),
     }
-
-
-def _streak(
-    moments: dict[str, NDArray[np.float64]], snr: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Length of each object's streak, px, 0 if it is round, and its angle, rad."""
-    xx, yy, xy = moments["xx"], moments["yy"], moments["xy"]
-    split = np.hypot((xx - yy) / 2, xy)
-    # A round object's moments differ by chance: by its SNR (97 % of them by less than this), and
-    # by the pixel grid.
-    chance = np.maximum(0.25, 10 / np.maximum(snr, 1)) * ((xx + yy) / 2 - split)
-    length = np.where(2 * split > chance, np.sqrt(12 * 2 * split), 0)
-    angle = np.arctan2(2 * xy, xx - yy) / 2
-    return length, np.where(angle <= -np.pi / 2, np.pi / 2, angle)
 
 
 def _untruncated(cut: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Work in parts: small enough for the processor's cache, on several threads.
 
 Used by the stages that touch most data.  OpenCV and NumPy let other threads run while they work,

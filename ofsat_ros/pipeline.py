@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The pipeline: the order of the stages, and what is kept of the frames before.
 
 The one place that knows all stages.  Live nodes and offline commands feed it one image at a time
@@ -7,7 +8,7 @@ and get a `FrameResult`; what is different between them lies outside.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 
@@ -35,11 +36,14 @@ from ofsat_ros.history import History, PastFrame
 from ofsat_ros.objects import find_objects
 from ofsat_ros.optical_flow import FlowInput
 from ofsat_ros.parameters import Parameters
-from ofsat_ros.pixels import Regions, rows_and_columns
-from ofsat_ros.preprocessing import Preprocessed, SensorMemory, preprocess
+from ofsat_ros.pixels import Regions, positions, rows_and_columns
+from ofsat_ros.preprocessing import Preprocessed, SensorMemory, learn, preprocess
 from ofsat_ros.star_field import StarFieldMotion
 from ofsat_ros.timeline import AstrayError, Timeline
 from ofsat_ros.tracking import TRACK_DTYPE, Settled, Tracker
+
+# What is done with an image and its stamp.
+_Act = Callable[[NDArray[np.generic], int], FrameResult]
 
 _SMALLEST_SIDE = 16
 _DTYPES = ("uint8", "uint16", "float32")
@@ -74,6 +78,7 @@ class Pipeline:
         self.parameters = parameters or Parameters.preset()
         self._previous: Seen | None = None
         self._timeline = Timeline()
+        self._has_learned = False
         # An image whose stamp is not believed yet, with that stamp.
         self._held: tuple[NDArray[np.generic], int] | None = None
         self._sensor = SensorMemory()
@@ -116,6 +121,15 @@ class Pipeline:
             self._field_rate = self._since = None
             self._tracks = np.zeros(0, TRACK_DTYPE), 0
 
+    def learn(self, image: NDArray[np.generic], stamp_ns: int) -> None:
+        """Take of the next image only what it teaches of the sensor, and of the camera's times.
+
+        For a start in the middle of a recording: what is processed then goes on from there as if
+        all had been processed, but for tracks, which are born anew.  Parameters and errors are
+        those of `process`.
+        """
+        self._take(image, stamp_ns, self._learn)
+
     def process(self, image: NDArray[np.generic], stamp_ns: int) -> FrameResult:
         """Process the next image.
 
@@ -138,9 +152,13 @@ class Pipeline:
             (`Timeline`).  The previous frame stays as it was.  If the next stamp goes on from
             one that was astray, its result brings what this frame gave.
         """
+        return self._take(image, stamp_ns, self._process)
+
+    def _take(self, image: NDArray[np.generic], stamp_ns: int, act: _Act) -> FrameResult:
+        """Do something with an image that is one, and leave a clean state whatever happens."""
         _check(image)
         try:
-            return self._follow(image, stamp_ns)
+            return self._follow(image, stamp_ns, act)
         except ImageError:
             raise
         except BaseException:
@@ -148,10 +166,10 @@ class Pipeline:
             self.reset("an error in the frame before")
             raise
 
-    def _follow(self, image: NDArray[np.generic], stamp_ns: int) -> FrameResult:
+    def _follow(self, image: NDArray[np.generic], stamp_ns: int, act: _Act) -> FrameResult:
         """Refuse a stamp that is astray; start afresh where time has jumped."""
         held, self._held = self._held, None
-        if self._previous is None:
+        if self._previous is None and not self._has_learned:
             self._timeline = Timeline()
         try:
             jump_s = self._timeline.judge(stamp_ns)
@@ -165,13 +183,22 @@ class Pipeline:
             self.reset(f"time {how} by {abs(jump_s):g} s")
             if held is not None:
                 with suppress(ImageError):
-                    before = self._process(*held)
-        result = self._process(image, stamp_ns)
+                    before = act(*held)
+        result = act(image, stamp_ns)
         self._timeline.take(stamp_ns)
         if before is not None:
             result.held_back = before
             result.settled, before.settled = before.settled + result.settled, []
         return result
+
+    def _learn(self, image: NDArray[np.generic], stamp_ns: int) -> FrameResult:
+        try:
+            learn(image, self.parameters, self._sensor)
+        except ValueError as error:
+            raise ImageError(str(error)) from error
+        self._frames += 1
+        self._has_learned = True
+        return FrameResult(stamp_ns, self._frames - 1, (image.shape[0], image.shape[1]))
 
     def _process(self, image: NDArray[np.generic], stamp_ns: int) -> FrameResult:
         parameters = self.parameters
@@ -184,26 +211,12 @@ class Pipeline:
             except ValueError as error:
                 raise ImageError(str(error)) from error
         self._frames += 1
+        self._has_learned = False
         result.background, result.noise = pre.background, pre.noise
         result.threshold = pre.threshold
         with _timed(result.seconds, "objects"):
-            result.objects, regions = find_objects(
-                pre.above,
-                pre.image_at(pre.above),
-                pre.smoothed,
-                pre.pixel_noise,
-                pre.noise,
-                pre.noise_ratio,
-                parameters.min_area_px,
-                parameters.max_objects,
-                pre.blind,
-            )
-        xy, sigma = _pairs(result.objects, "x", "y"), _pairs(result.objects, "sigma_x", "sigma_y")
-        length = result.objects["length"]
-        flow_input = FlowInput(
-            pre.smoothed, pre.above, pre.pedestal, regions, xy, sigma, length, pre.noise
-        )
-        current = Seen(stamp_ns, image.dtype, parameters, result.objects, flow_input)
+            current = _seen(pre, stamp_ns, image.dtype, parameters)
+        result.objects = current.objects
         if self._previous is not None and (why := why_not_comparable(self._previous, current)):
             self.reset(why)
         if self._previous is not None:
@@ -216,7 +229,7 @@ class Pipeline:
         known = self._places_expected(stamp_ns)
         self._guessing = blind and (self._field_rate is not None or current.shows_stars(known))
         if parameters.rso_test == "history":
-            self._remember(pre, regions, result, parameters)
+            self._remember(pre, current.flow_input.regions, result, parameters)
             self._track(pre.defects, result, parameters)
         else:
             self._forget()
@@ -270,7 +283,7 @@ class Pipeline:
         """Where the tracks are if all goes on as it did, (K, 2) px."""
         tracks, since_ns = self._tracks
         seconds = (stamp_ns - since_ns) / 1e9
-        return _pairs(tracks, "x", "y") + seconds * _pairs(tracks, "vx", "vy")
+        return positions(tracks) + seconds * np.stack([tracks["vx"], tracks["vy"]], axis=1)
 
     def _remember(
         self, pre: Preprocessed, regions: Regions, result: FrameResult, parameters: Parameters
@@ -360,8 +373,30 @@ def _check(image: NDArray[np.generic]) -> None:
         )
 
 
-def _pairs(objects: NDArray[np.void], first: str, second: str) -> NDArray[np.float64]:
-    return np.stack([objects[first], objects[second]], axis=1)
+def _seen(pre: Preprocessed, stamp_ns: int, dtype: np.dtype, parameters: Parameters) -> Seen:
+    """Find the objects of a frame, and set them out for comparison with others."""
+    objects, regions = find_objects(
+        pre.above,
+        pre.image_at(pre.above),
+        pre.smoothed,
+        pre.pixel_noise,
+        pre.noise,
+        pre.noise_ratio,
+        parameters.min_area_px,
+        parameters.max_objects,
+        pre.blind,
+    )
+    flow_input = FlowInput(
+        smoothed=pre.smoothed,
+        above=pre.above,
+        pedestal=pre.pedestal,
+        regions=regions,
+        xy=positions(objects),
+        sigma=np.stack([objects["sigma_x"], objects["sigma_y"]], axis=1),
+        length=objects["length"],
+        noise=pre.noise,
+    )
+    return Seen(stamp_ns, dtype, parameters, objects, flow_input)
 
 
 @contextmanager

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Text that others wrote, on its way to a terminal.
 
 Names of topics and of files, headers and diagnostics come from whoever recorded or sent them, and

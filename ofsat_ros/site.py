@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Where the camera stands on the Earth, and the azimuth and elevation of what it sees.
 
 Outside the flow of the stages: who writes results asks here.  Right ascension and declination, as

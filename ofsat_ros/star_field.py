@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The motion of the star field: the motion that most objects share.
 
 Fourth stage: takes flow vectors and finds the one motion behind most of them; what follows asks
@@ -354,12 +355,8 @@ def _robust_fit(
     measured, known = displacement.ravel(), (1 / sigma**2).ravel()
     weight = np.where(start, 1.0, 0.0)
     values, covariance = np.zeros(4), np.zeros((4, 4))
-    used, spread = _SHIFT, 1.0
     for _ in range(15):
-        count = np.count_nonzero(weight) if model == "similarity" else 0
-        used = _SHIFT if count < _STARS_FOR_TURN else _TURN
-        if count >= _STARS_FOR_SIMILARITY:
-            used = _SIMILARITY
+        used = _what_to_fit(model, int(np.count_nonzero(weight)))
         rows = design[used]
         weighted = rows * (np.repeat(weight, 2) * known)
         inverse = np.linalg.pinv(weighted @ rows.T, _LEAST_CONDITION)
@@ -392,6 +389,13 @@ def _robust_fit(
         speed_std=float(speed[inliers].std()),
         model="shift" if used is _SHIFT else "similarity",
     )
+
+
+def _what_to_fit(model: str, stars: int) -> list[int]:
+    """Which of the four parameters so many stars tell."""
+    if model != "similarity" or stars < _STARS_FOR_TURN:
+        return _SHIFT
+    return _TURN if stars < _STARS_FOR_SIMILARITY else _SIMILARITY
 
 
 def _log_chance(found: int, of: int, share: float) -> float:

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The times of frames: which follow one another, and which are astray.
 
 Stands wherever frames come in one after the other: before the pipeline, the guide and the tracking

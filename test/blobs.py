@@ -1,9 +1,12 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Star images in plain NumPy, for tests that must not lean on the package's own simulator."""
 
 import math
 
 import numpy as np
 
+# DN of `camera`.
+_NOISE = {np.uint8: 3.0, np.uint16: 10.0}
 _erf = np.frompyfunc(math.erf, 1, 1)
 
 
@@ -29,6 +32,11 @@ def flux_of_snr(snr, noise, sigma):
     return np.asarray(snr) * noise * 2 * math.sqrt(math.pi) * sigma
 
 
+def flux(snr, streak=(0.0, 0.0)):
+    """Flux in `camera`'s 16 bits of a PSF of 1 px; the same brightness per px along a streak."""
+    return flux_of_snr(snr, _NOISE[np.uint16], 1.0) * math.sqrt(1 + math.hypot(*streak) / 3.5)
+
+
 def scattered(rng, shape, spacing, margin=12):
     """Positions (N, 2), one at random in each cell, not nearer to another than half a cell."""
     y, x = (np.arange(margin, size - margin - spacing / 2, spacing) for size in shape)
@@ -39,6 +47,6 @@ def scattered(rng, shape, spacing, margin=12):
 def camera(signal, rng, dtype=np.uint16, background=None, noise=None):
     """Add a background and noise and round to whole DN."""
     background = {np.uint8: 30, np.uint16: 1000}[dtype] if background is None else background
-    noise = {np.uint8: 3, np.uint16: 10}[dtype] if noise is None else noise
+    noise = _NOISE[dtype] if noise is None else noise
     image = np.rint(signal + background + rng.normal(0, noise, signal.shape))
     return np.clip(image, 0, np.iinfo(dtype).max).astype(dtype)

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Pixels to directions and back: against OpenCV, astropy's WCS, closed forms and differences."""
 
 from types import SimpleNamespace

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Which vectors are RSOs: on hand-made flow, and on plain images of stars and RSOs."""
 
 import numpy as np

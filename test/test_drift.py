@@ -1,50 +1,23 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Drift: what leaves its place on the sky slowly, and stars, which do not."""
 
 import math
 
 import numpy as np
 import pytest
-from blobs import blobs, camera, flux_of_snr, scattered
+from blobs import blobs, camera, flux, scattered
+from sky import SECOND_NS, past
 
 from ofsat_ros.detection import drift as drift_module
 from ofsat_ros.detection import find_drifting
 from ofsat_ros.history import History, PastFrame
-from ofsat_ros.objects import find_objects
-from ofsat_ros.parameters import Parameters
-from ofsat_ros.preprocessing import preprocess
 
 SHAPE = (180, 180)
-NOISE = 10.0
 LOG_LIMIT = math.log(1e-3)
 FRAMES = 8
 # Where two objects are in the last frame.
 PLACES = np.array([[70.3, 60.6], [115.8, 120.1]])
 FIELDS = [(0.0, 0.0), (6.9, -4.0)]
-
-
-def past(image, number, shift, dt_s):
-    """A frame as the pipeline puts it into the history; its place on the sky is given."""
-    pre = preprocess(image, Parameters())
-    measured = pre.pixel_noise, pre.noise, pre.noise_ratio
-    objects, regions = find_objects(pre.above, pre.image_at(pre.above), pre.smoothed, *measured)
-    to_sky = np.eye(3)
-    to_sky[:2, 2] = -np.multiply(shift, number)
-    return PastFrame(
-        number=number,
-        stamp_ns=round(number * dt_s * 1e9),
-        smoothed=pre.smoothed,
-        noise=pre.noise,
-        noise_ratio=pre.noise_ratio,
-        objects=objects,
-        regions=regions,
-        bright=pre.bright,
-        to_sky=to_sky,
-    )
-
-
-def flux(snr, streak):
-    """Flux of a point of PSF sigma 1 px; the same brightness per px along a streak."""
-    return flux_of_snr(snr, NOISE, 1.0) * math.sqrt(1 + math.hypot(*streak) / 3.5)
 
 
 def history_of(
@@ -74,7 +47,10 @@ def history_of(
             place = objects[number] + (0 if wobble is None else wobble(number))
             own = velocity * exposure
             light = light + blobs(SHAPE, place, flux(snr, own), 1.0, own)
-        history.add(past(camera(light, rng), int(number), field, dt_s))
+        to_sky = np.eye(3)
+        to_sky[:2, 2] = -np.multiply(field, number)
+        step_ns = round(dt_s * SECOND_NS)
+        history.add(past(camera(light, rng), int(number), to_sky, step_ns))
     return history, objects
 
 
@@ -252,8 +228,8 @@ def test_frames_without_objects_show_no_drift():
     rng = np.random.default_rng(14)
     history = History(FRAMES)
     for number in range(4):
-        history.add(past(np.full(SHAPE, 1000, np.uint16), number, (0, 0), 1.0))
+        history.add(past(np.full(SHAPE, 1000, np.uint16), number))
         assert find_drifting(history, LOG_LIMIT) == []
     light = blobs(SHAPE, PLACES, flux(40, (0, 0)), 1.0)
-    history.add(past(camera(light, rng), 4, (0, 0), 1.0))
+    history.add(past(camera(light, rng), 4))
     assert find_drifting(history, LOG_LIMIT) == []

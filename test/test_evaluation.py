@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Evaluation: every rule of the scoring, each with a case made by hand."""
 
 import json

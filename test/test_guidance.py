@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The guide against a toy plant: a mount, a target and perfect tracks, without images."""
 
 from collections.abc import Callable, Iterator

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The closed loop: simulated images, detector, guide and mount, in the simulation's own time."""
 
 from collections.abc import Iterator

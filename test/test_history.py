@@ -1,9 +1,11 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """History: frames of known motion and brightness, put on the sky and read between the pixels."""
 
 import math
 
 import numpy as np
 import pytest
+from sky import regions_of
 
 from ofsat_ros.history import History, PastFrame
 from ofsat_ros.objects import OBJECT_DTYPE
@@ -28,7 +30,7 @@ def past(number=0, smoothed=None, to_sky=None, objects=(), labels=None, noise=1.
         noise=noise,
         noise_ratio=np.array(ratio, np.float32),
         objects=table,
-        regions=Regions(SHAPE) if labels is None else Regions.of_labels(labels),
+        regions=Regions(SHAPE) if labels is None else regions_of(labels),
         to_sky=np.eye(3) if to_sky is None else np.array(to_sky, float),
     )
 

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Bytes to arrays: every encoding, byte order and padding, and every defect by name."""
 
 import array

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Linking: paths among spots, and how many of them chance gives."""
 
 import dataclasses

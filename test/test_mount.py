@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The simulated mount: it does what it is told, within its limits, and stops when told no more."""
 
 import math

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Objects: centroids, fluxes, SNR and shapes against sources that are known exactly."""
 
 import math
@@ -6,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, label
 from scipy.special import erf
+from sky import labels_of
 
 from ofsat_ros.objects import OBJECT_DTYPE, _valleys, find_objects
 
@@ -51,7 +53,7 @@ def measure(image, smoothed, mask, *noise, **options):
     pixels = np.flatnonzero(mask)
     values, smoothed = image.ravel()[pixels], smoothed.astype(np.float32)
     objects, regions = find_objects(pixels, values, smoothed, *noise, **options)
-    return objects, regions.labels()
+    return objects, labels_of(regions)
 
 
 def measure_points(snr: float, trials: int = 400) -> tuple[np.ndarray, np.ndarray, float]:

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Lucas-Kanade against closed-form motion, and the dense engine against a slow reference."""
 
 import dataclasses
@@ -5,6 +6,7 @@ import dataclasses
 import numpy as np
 import pytest
 from blobs import blobs, camera, flux_of_snr, scattered
+from sky import regions_of
 
 from ofsat_ros.optical_flow import (
     DenseLucasKanade,
@@ -16,7 +18,6 @@ from ofsat_ros.optical_flow import (
 )
 from ofsat_ros.parameters import Parameters
 from ofsat_ros.pipeline import Pipeline
-from ofsat_ros.pixels import Regions
 
 # A star of PSF sigma 1 px after the smoothing by 1 px.
 WIDTH = np.sqrt(2)
@@ -39,7 +40,7 @@ def flow_input(smoothed, xy, noise=1.0, length=0.0, threshold=4.0, pedestal=0.0)
         smoothed=smoothed.astype(np.float32),
         above=np.flatnonzero(mask),
         pedestal=pedestal,
-        regions=Regions.of_labels(labels),
+        regions=regions_of(labels),
         xy=xy,
         sigma=np.full_like(xy, 0.01),
         length=np.full(len(xy), float(length)),
@@ -351,7 +352,7 @@ def test_dense_native_targets_are_regions_of_the_map_of_speeds(monkeypatch):
     labels = np.zeros((30, 40), np.int32)
     labels[5, 10:13], labels[20:22, 30:32] = 1, 2
     above = np.setdiff1d(current.above, [10 * 40 + 20])
-    current = dataclasses.replace(current, above=above, regions=Regions.of_labels(labels))
+    current = dataclasses.replace(current, above=above, regions=regions_of(labels))
     engine = DenseLucasKanade(Parameters.preset("paper_matlab"))
     monkeypatch.setattr(engine, "velocity_map", lambda *_: (velocity, solved))
     flow = engine.measure(current, current, STILL)
@@ -373,7 +374,7 @@ def test_dense_object_targets_take_the_median_of_each_objects_pixels(monkeypatch
     inputs = flow_input(np.full((30, 40), 9.0), [(10, 5), (30, 20)])
     labels = np.zeros((30, 40), np.int32)
     labels[5, 8:13], labels[20, 29:32] = 1, 2
-    inputs = dataclasses.replace(inputs, regions=Regions.of_labels(labels))
+    inputs = dataclasses.replace(inputs, regions=regions_of(labels))
     velocity[5, 8:12] = (1, 0), (2, 0), (3, 4), (99, 0)
     solved[5, 8:11] = True
     engine = DenseLucasKanade(Parameters.preset("robust", engine="dense"))

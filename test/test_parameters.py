@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The table of parameters: what it says, what it refuses, and what derives from it."""
 
 import dataclasses

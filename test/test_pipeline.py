@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The pipeline: order of stages, what is kept of the frames before, and reasons in words."""
 
 import functools

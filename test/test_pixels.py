@@ -1,10 +1,19 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Lists of pixels: the same regions, labels and values as images of them give."""
 
 import cv2
 import numpy as np
 import pytest
+from sky import labels_of, regions_of
 
-from ofsat_ros.pixels import Regions, connected, interpolate, rows_and_columns
+from ofsat_ros.pixels import (
+    Regions,
+    connected,
+    inside,
+    interpolate,
+    rows_and_columns,
+    streak_of,
+)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.5, 0.9])
@@ -56,10 +65,10 @@ def test_rows_and_columns():
 def test_regions_know_whose_each_pixel_is():
     labels = np.zeros((6, 8), np.int32)
     labels[1, 2:5], labels[4:6, 7] = 2, 1
-    regions = Regions.of_labels(labels)
+    regions = regions_of(labels)
     y, x = np.indices(labels.shape)
     assert np.array_equal(regions.at(y, x), labels - 1)
-    assert np.array_equal(regions.labels(), labels)
+    assert np.array_equal(labels_of(regions), labels)
     assert Regions((6, 8)).at(y, x).tolist() == np.full((6, 8), -1).tolist()
 
 
@@ -80,3 +89,30 @@ def test_beyond_its_border_a_plane_goes_on_as_it_is_there():
     plane = np.arange(12, dtype=np.float32).reshape(3, 4)
     x, y = np.array([-5.0, 9.0, 1.0]), np.array([0.0, 2.0, 70.0])
     assert interpolate(plane, x, y, cv2.INTER_LINEAR).tolist() == [0, 11, 9]
+
+
+def test_inside_is_up_to_the_outermost_pixels_centres():
+    xy = np.array([[0, 0], [7, 5], [7.01, 5], [3, -0.01], [2, 2], [1.9, 2], [5, 3], [5, 3.1]])
+    assert inside(xy, (6, 8)).tolist() == [True, True, False, False, True, True, True, True]
+    assert inside(xy[4:], (6, 8), 2.0).tolist() == [True, False, True, False]
+
+
+@pytest.mark.parametrize("degrees", [0, 30, 90, -60])
+def test_a_streak_is_as_long_as_the_line_of_its_moments(degrees: float):
+    """Of a point's variance of 2 px^2, and L^2/12 along the line."""
+    along = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
+    moments = 2 * np.eye(2) + 12**2 / 12 * np.outer(along, along)
+    # What rounding leaves of the mixed moment of an upright line must not turn it round.
+    mixed = moments[0, 1] if degrees % 90 else -1e-20
+    length, angle = streak_of(*np.array([[moments[0, 0]], [moments[1, 1]], [mixed], [50.0]]))
+    assert length == pytest.approx(12)
+    assert np.degrees(angle) == pytest.approx(degrees, abs=1e-9)
+
+
+def test_what_may_be_round_by_its_snr_has_no_length():
+    same = np.full(2, 2.0)
+    length, _ = streak_of(same + 0.5, same, np.zeros(2), np.array([5.0, 500.0]))
+    assert length.tolist() == [0, 0]
+    length, _ = streak_of(same + 4.0, same, np.zeros(2), np.array([5.0, 500.0]))
+    # A variance 4 px^2 larger along a line is one of sqrt(48) px, unless chance makes it so.
+    assert length == pytest.approx([0, np.sqrt(48)])

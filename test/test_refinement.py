@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Streaks measured again: their middle, to what their noise allows, and what is said of it."""
 
 import math

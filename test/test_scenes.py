@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The whole pipeline on the simulator's scenarios: what it finds, and that it invents nothing."""
 
 from functools import cache

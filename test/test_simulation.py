@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The simulator: what it renders is what its settings and its truth say."""
 
 import dataclasses

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The simulated sphere: stars and RSOs are in the image where attitude and camera put them."""
 
 import itertools

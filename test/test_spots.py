@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Spots: sources that other frames do not have are found, and what they have is not."""
 
 import math
@@ -5,14 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from blobs import blobs, camera, flux_of_snr, scattered
+from blobs import blobs, camera, flux, flux_of_snr, scattered
 from scipy.ndimage import gaussian_filter, maximum_filter
+from sky import past
 
 from ofsat_ros.detection import BORDER_PX, SPOT_DTYPE, find_spots, refine, spot_near
 from ofsat_ros.history import PastFrame
-from ofsat_ros.objects import find_objects
-from ofsat_ros.parameters import Parameters
-from ofsat_ros.preprocessing import preprocess
 
 SHAPE = (160, 160)
 NOISE = 10.0
@@ -20,29 +19,6 @@ NOISE = 10.0
 SMOOTHED = 0.2821
 # 160 x 160 px of noise alone hold 0.002 spots of 5.5 sigmas (Adler's formula, below).
 SURE = 5.5
-
-
-def past(image, number=0, to_sky=None):
-    """A frame as the pipeline puts it into the history; its place on the sky is given."""
-    pre = preprocess(image, Parameters())
-    measured = pre.pixel_noise, pre.noise, pre.noise_ratio
-    objects, regions = find_objects(pre.above, pre.image_at(pre.above), pre.smoothed, *measured)
-    return PastFrame(
-        number=number,
-        stamp_ns=number * 10**9,
-        smoothed=pre.smoothed,
-        noise=pre.noise,
-        noise_ratio=pre.noise_ratio,
-        objects=objects,
-        regions=regions,
-        bright=pre.bright,
-        to_sky=np.eye(3) if to_sky is None else to_sky,
-    )
-
-
-def flux(snr, streak=(0.0, 0.0)):
-    """Flux of a point of PSF sigma 1 px; the same brightness per px along a streak."""
-    return flux_of_snr(snr, NOISE, 1.0) * math.sqrt(1 + math.hypot(*streak) / 3.5)
 
 
 def sequence(rng, count, signal, shift=(0.0, 0.0)):

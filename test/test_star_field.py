@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The field's motion, from known vectors and from known positions."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Suggestions: what is measured of a recording, what is proposed, and that it finds more."""
 
 import dataclasses

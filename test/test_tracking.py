@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Tracks: the filter, their ids, their ends, and what is said of them."""
 
 import dataclasses

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Tracking data: other readers find in the files what was put in; files are whole or absent."""
 
 import math
@@ -463,8 +464,9 @@ class TestFiles:
             raise OSError(28, "No space left on device")
 
         monkeypatch.setattr(files.os, step, full)
-        with pytest.raises(OSError, match="No space left"):
+        with pytest.raises(OSError, match="No space left") as error:
             collected().write(path, "xml", force=True)
+        assert error.value.filename == f"{path}"
         assert [p.read_text() for p in tmp_path.iterdir()] == ([old] if old else [])
 
     def test_a_file_that_may_not_grow_is_not_there(self, tmp_path):

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Pixels to directions and back: lines of sight, right ascension and declination, and errors.
 
 Stands beside the stages: the detector node and ``ofsat process`` ask it where the things are that

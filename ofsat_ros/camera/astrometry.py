@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Where a camera looks: attitudes over time, and the directions of what was detected."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What a lens does: from the direction of light to a point of the image plane.
 
 Points here are in units of the focal length, (pixel - principal point) / f; a camera adds the

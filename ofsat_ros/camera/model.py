@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The camera: pixels to lines of sight and back, and these to right ascension and declination."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Detection: what does not move with the star field.
 
 Fifth stage.  `detect` compares two frames, as published; `find_spots` and `find_drifting` compare
@@ -12,6 +13,8 @@ from ofsat_ros.detection.two_frames import (
     CONFIRMED,
     DETECTION_DTYPE,
     DIRECTION_FIELDS,
+    MEASURED_FIELDS,
+    POINT_WIDTH_PX,
     detect,
 )
 
@@ -21,6 +24,8 @@ __all__ = [
     "CONFIRMED",
     "DETECTION_DTYPE",
     "DIRECTION_FIELDS",
+    "MEASURED_FIELDS",
+    "POINT_WIDTH_PX",
     "SPOT_DTYPE",
     "Drift",
     "detect",

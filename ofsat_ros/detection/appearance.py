@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Spots: what shines where the star field, as the other frames show it, has nothing.
 
 What ``starlight`` leaves over is a spot: an RSO, noise, a cosmic ray or a defect of the sensor.
@@ -17,9 +18,16 @@ from ofsat_ros.detection.starlight import (
     star_error_of,
     star_light,
 )
+from ofsat_ros.detection.two_frames import MEASURED_FIELDS, POINT_WIDTH_PX, first_of_each
 from ofsat_ros.history import PastFrame
 from ofsat_ros.parallel import in_parallel
-from ofsat_ros.pixels import connected, rows_and_columns
+from ofsat_ros.pixels import (
+    SPOT_PIXEL_SIGMAS,
+    connected,
+    positions,
+    rows_and_columns,
+    streak_of,
+)
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -41,8 +49,6 @@ SPOT_DTYPE = np.dtype(
     ]
 )
 
-# Where spots' pixels end, in sigmas; their peaks exceed `spot_sigmas`.
-_LOW_SIGMAS = 2.5
 # Small groups of pixels, and the star light under which there is none, in sigmas.
 _SMALL_PX, _DARK_SIGMAS = 12, 0.5
 # A pixel of a star that is worth a look is brighter than before by this, in sigmas.
@@ -51,8 +57,6 @@ _BRIGHTER_SIGMAS = 2.0
 _PART = 16384
 # Spots nearer to the border are cut by it, px.
 BORDER_PX = 3.5
-# Gaussian width of a point source in the smoothed image, px: a PSF of about 1 and the smoothing.
-POINT_WIDTH_PX = 1.4
 # Where the surroundings of a spot are looked at: outside a point, and at many sides of a streak.
 # Noise gives them less than this.
 _RING_PX, _RING_POINTS, _RING_SIGMAS = 7.0, 12, 1.0
@@ -89,7 +93,7 @@ def find_spots(
         return np.zeros(0, SPOT_DTYPE)
     pixels, excess, clean, star = _fresh_pixels(frame, others, spot_sigmas)
     spots = _measure(frame, pixels, excess, clean, star)
-    xy = np.stack([spots["x"], spots["y"]], axis=1)
+    xy = positions(spots)
     inside = frame.contains(xy, BORDER_PX)
     if frame.blind is not None:
         column, row = np.rint(xy).astype(np.intp).T
@@ -100,7 +104,7 @@ def find_spots(
     spots["snr"] -= np.where(spots["object_index"] < 0, wide, 0)
     spots = spots[spots["excess"] > spot_sigmas]
     spots = spots[np.argsort(-spots["excess"], kind="stable")]
-    return _one_per_object(spots)
+    return spots[first_of_each(spots["object_index"])]
 
 
 def _fresh_pixels(
@@ -119,7 +123,7 @@ def _fresh_pixels(
     peaks = np.flatnonzero((sigmas == highest[group]) & (sigmas > spot_sigmas))
     peaks = peaks[np.unique(group[peaks], return_index=True)[1]]
     error = star_error_of(frame, others, pixels[light > BRIGHT_SIGMAS * frame.noise])
-    excess, clean, star = excess_over_stars(frame, others, pixels[peaks], error, _LOW_SIGMAS)
+    excess, clean, star = excess_over_stars(frame, others, pixels[peaks], error, SPOT_PIXEL_SIGMAS)
 
     size = np.bincount(group, minlength=count)[group[peaks]]
     alone = (size <= _SMALL_PX) & (star < _DARK_SIGMAS * noise[peaks])
@@ -134,11 +138,11 @@ def _fresh_pixels(
     at_stars[group[peaks[~alone]]] = True
     single = np.flatnonzero(at_stars[group])
     single = single[_brighter(frame, others, pixels[single], light[single], noise[single])]
-    second = excess_over_stars(frame, others, pixels[single], error, _LOW_SIGMAS)
+    second = excess_over_stars(frame, others, pixels[single], error, SPOT_PIXEL_SIGMAS)
 
     rows = np.concatenate([together, single])
     excess, clean, star = (np.concatenate(both) for both in zip(first, second, strict=True))
-    fresh = np.flatnonzero(excess > _LOW_SIGMAS)
+    fresh = np.flatnonzero(excess > SPOT_PIXEL_SIGMAS)
     # In the order of the image again.
     fresh = fresh[np.argsort(rows[fresh], kind="stable")]
     return pixels[rows[fresh]], excess[fresh], clean[fresh], star[fresh]
@@ -150,7 +154,7 @@ def _bright_groups(frame: PastFrame) -> tuple[Index, Array, Array, Index, int]:
     pixels = np.stack([x, y], axis=1)
     light = frame.smoothed.ravel()[frame.bright].astype(np.float64)
     noise = frame.noise_at(pixels)
-    usable = np.flatnonzero(light > _LOW_SIGMAS * noise)
+    usable = np.flatnonzero(light > SPOT_PIXEL_SIGMAS * noise)
     group, count = connected(frame.bright[usable], frame.shape[1])
     return pixels[usable], light[usable], noise[usable], group, count
 
@@ -181,7 +185,7 @@ def _surroundings(frame: PastFrame, others: Sequence[PastFrame], spots: NDArray[
     """Light around each spot that is no star's, in sigmas, (N,): a wisp of a cloud is wide."""
     angle = np.arange(_RING_POINTS) * 2 * np.pi / _RING_POINTS
     ring = _RING_PX * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    xy = np.stack([spots["x"], spots["y"]], axis=1)
+    xy = positions(spots)
     limit = np.array(frame.shape[::-1]) - 1
     pixels = np.clip(np.rint(xy[:, None] + ring), 0, limit).astype(np.intp)
     noise = frame.noise_at(pixels.reshape(-1, 2)).reshape(pixels.shape[:2])
@@ -256,7 +260,6 @@ def _measure(
     dx, dy = x - cx[group], y - cy[group]
     # A pixel is a square of side 1: its variance keeps a single pixel from having none.
     xx, yy = mean(dx * dx, weight) + 1 / 12, mean(dy * dy, weight) + 1 / 12
-    xy = mean(dx * dy, weight)
     peak = np.full(count, -np.inf)
     np.maximum.at(peak, group, excess)
     top_pixel = np.zeros(count, np.intp)
@@ -264,10 +267,7 @@ def _measure(
     top_pixel[group[highest]] = highest
     spots["x"], spots["y"], spots["excess"], spots["snr"] = cx, cy, peak, peak
     spots["sigma_x"] = spots["sigma_y"] = POINT_WIDTH_PX / np.maximum(peak, 1)
-    split = np.hypot((xx - yy) / 2, xy)
-    chance = np.maximum(0.25, 10 / np.maximum(peak, 1)) * ((xx + yy) / 2 - split)
-    spots["length"] = np.where(2 * split > chance, np.sqrt(24 * split), 0)
-    spots["angle"] = np.arctan2(2 * xy, xx - yy) / 2
+    spots["length"], spots["angle"] = streak_of(xx, yy, mean(dx * dy, weight), peak)
     spots["clean"] = mean(clean, weight**2) > 0.5
     light = frame.smoothed[y, x] - star
     # A Gaussian's flux is its peak times its area.
@@ -291,12 +291,6 @@ def _take_objects(spots: NDArray[np.void], frame: PastFrame, new: Array) -> None
     round_one = (objects["length"][index] < 4) & (shift < 2.5)
     same = (fraction > _MOSTLY_NEW) | round_one
     rows = np.flatnonzero(owned)[same]
-    for name in ("x", "y", "sigma_x", "sigma_y", "snr", "flux", "length", "angle"):
+    for name in MEASURED_FIELDS:
         spots[name][rows] = objects[name][index[same]]
     spots["object_index"][np.flatnonzero(owned)[~same]] = -1
-
-
-def _one_per_object(spots: NDArray[np.void]) -> NDArray[np.void]:
-    """Of several spots measured by one object, the first."""
-    owner = np.where(spots["object_index"] >= 0, spots["object_index"], -1 - np.arange(len(spots)))
-    return spots[np.sort(np.unique(owner, return_index=True)[1])]

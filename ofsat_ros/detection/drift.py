@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Drifting objects: what has left its place on the sky over several frames, however slowly.
 
 A slow RSO hides behind itself: after one frame it has hardly left its place, and `find_spots`
@@ -16,6 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from ofsat_ros.history import History, PastFrame
+from ofsat_ros.pixels import as_complex, interpolate, positions
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -117,7 +119,7 @@ def find_drifting(history: History, log_limit: float, known: Collection[int] = (
     still, scale = _stand_still(frame, earlier)
     still[list(known)] = True
     followed = np.flatnonzero(~still)
-    times = np.array([_seconds(other, frame) for other in (frame, *earlier)])
+    times = np.array([other.seconds_since(frame) for other in (frame, *earlier)])
     rows, places, variance = _follow(frame, earlier, times, followed)
     found = rows >= 0
     lines = _Lines(times, places, found)
@@ -126,19 +128,19 @@ def find_drifting(history: History, log_limit: float, known: Collection[int] = (
     significance = speed * np.sqrt(lines.spread) / error / scale
     log_false = np.log(len(frame.objects)) - significance**2 / 2
     # The newest frame, where all were found, is no test.
-    residual = (lines.at(0.0)[:, None] + lines.velocity[:, None] * times - places)[:, 1:]
+    off = lines.at(0.0)[:, None] + lines.velocity[:, None] * times - places
+    squares = np.abs(off) ** 2 * found
     hits = lines.count - 1
-    rms = np.sqrt(np.sum(np.abs(residual) ** 2 * found[:, 1:], axis=1) / np.maximum(hits, 1))
+    rms = np.sqrt(squares[:, 1:].sum(axis=1) / np.maximum(hits, 1))
     drift = speed * np.max(np.where(found, -times, 0), axis=1)
     oldest = np.max(np.where(found, np.arange(len(times)), 0), axis=1)
     suspect = lines.long_enough & (log_false < log_limit)
     suspect &= hits >= _HITS_PER_MISS * (oldest - hits)
     suspect &= (drift > _LEAST_DRIFT_PX) & (drift > 3.5 * rms)
     suspect &= rms < np.maximum(0.3, 3 * error)
-    suspect &= frame.contains(_xy(frame.objects[followed]), _HALF_PX + 1)
+    suspect &= frame.contains(positions(frame.objects[followed]), _HALF_PX + 1)
     chosen = np.flatnonzero(suspect)
-    off = lines.at(0.0)[chosen, None] + lines.velocity[chosen, None] * times - places[chosen]
-    misfit = np.sum(np.abs(off) ** 2 * found[chosen], axis=1)
+    misfit = squares[chosen].sum(axis=1)
     chosen = chosen[misfit < _misfit_of_step(places[chosen], found[chosen])]
     if not chosen.size:
         return []
@@ -240,7 +242,7 @@ def _follow(
     shape = len(followed), len(times)
     rows, places = np.full(shape, -1, np.intp), np.zeros(shape, np.complex128)
     variance = np.zeros(shape)
-    last = _complex(frame.object_sky[followed])
+    last = as_complex(frame.object_sky[followed])
     rows[:, 0], places[:, 0], variance[:, 0] = followed, last, _variance(objects)
     misses = np.where(objects["edge"], _MOST_MISSES + 1, 0)
     for column, other in enumerate(earlier, start=1):
@@ -251,7 +253,7 @@ def _follow(
         near = np.flatnonzero((there >= 0) & (misses <= _MOST_MISSES))
         there = there[near]
         rows[near, column], variance[near, column] = there, _variance(other.objects[there])
-        last[near] = places[near, column] = _complex(other.object_sky[there])
+        last[near] = places[near, column] = as_complex(other.object_sky[there])
         misses += rows[:, column] < 0
     return rows, places, variance
 
@@ -267,12 +269,12 @@ def _flow_agrees(
 
     `found` tells in which of the earlier frames each object was seen, (N, K).
     """
-    times = np.array([_seconds(other, frame) for other in earlier])
+    times = np.array([other.seconds_since(frame) for other in earlier])
     expected = -velocity[:, None] * times[:, None] @ np.linalg.inv(frame.to_sky[:2, :2]).T
     which, against = np.nonzero(found & (np.hypot(*expected.T).T >= _LEAST_DRIFT_PX / 2))
     if not which.size:
         return np.zeros(len(rows), bool)
-    xy, weight = _xy(frame.objects)[rows], _weights(frame, rows)
+    xy, weight = positions(frame.objects)[rows], _weights(frame, rows)
     drift, covariance = _flow_against_field(frame, earlier, against, xy[which], weight[which])
     precision = np.linalg.inv(covariance)
 
@@ -295,7 +297,7 @@ def _weights(frame: PastFrame, rows: NDArray[np.intp]) -> Array:
 
     A brighter neighbour in the window, and its wings, would be what is measured.
     """
-    pixels = np.rint(_xy(frame.objects)[rows][:, None, None] + np.stack([_DX, _DY], axis=-1))
+    pixels = np.rint(positions(frame.objects)[rows][:, None, None] + np.stack([_DX, _DY], axis=-1))
     x, y = pixels.astype(np.intp).transpose(3, 0, 1, 2)
     owner = frame.regions.at(y, x)
     others = (owner >= 0) & (owner != rows[:, None, None])
@@ -363,31 +365,13 @@ def _flow_against_field(
 def _patches(frame: PastFrame, points: Array) -> Array:
     """Brightness at the points of windows (N, side, side, 2), (N, side, side)."""
     x, y = points.reshape(-1, points.shape[2], 2).astype(np.float32).transpose(2, 0, 1)
-    values = cv2.remap(
-        frame.smoothed,
-        np.ascontiguousarray(x),
-        np.ascontiguousarray(y),
-        cv2.INTER_CUBIC,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    values = interpolate(frame.smoothed, x.ravel(), y.ravel(), cv2.INTER_CUBIC)
     return values.astype(np.float64).reshape(points.shape[:3])
-
-
-def _seconds(other: PastFrame, frame: PastFrame) -> float:
-    return (other.stamp_ns - frame.stamp_ns) / 1e9
-
-
-def _xy(objects: NDArray[np.void]) -> Array:
-    return np.stack([objects["x"], objects["y"]], axis=1)
 
 
 def _variance(objects: NDArray[np.void]) -> Array:
     """Of a centroid along one axis, px^2."""
     return (objects["sigma_x"] ** 2 + objects["sigma_y"] ** 2) / 2
-
-
-def _complex(points: Array) -> NDArray[np.complex128]:
-    return points[:, 0] + 1j * points[:, 1]
 
 
 def _points(places: NDArray[np.complex128]) -> Array:

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Refinement: a spot measured again, with what its track knows of it.
 
 After ``tracking`` has said where a spot belongs and how it moves: a faint streak as a whole, a
@@ -11,9 +12,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ofsat_ros.detection.appearance import BORDER_PX, POINT_WIDTH_PX
+from ofsat_ros.detection.appearance import BORDER_PX
 from ofsat_ros.detection.starlight import star_light
+from ofsat_ros.detection.two_frames import POINT_WIDTH_PX
 from ofsat_ros.history import PastFrame
+from ofsat_ros.pixels import positions
 
 Array = NDArray[np.float64]
 
@@ -257,14 +260,14 @@ def _refined_points(
     hidden: NDArray[np.bool_],
 ) -> NDArray[np.void]:
     refined = spots.copy()
-    middle = np.rint(np.stack([spots["x"], spots["y"]], axis=1))
+    xy = positions(spots)
+    middle = np.rint(xy)
     rows = np.flatnonzero(frame.contains(middle, _WINDOW_PX))
     if not len(rows):
         return refined
     middle = middle[rows]
     light = _windows(frame, others, middle.astype(np.intp), hidden[:, rows])
-    start = np.stack([spots["x"][rows], spots["y"][rows]], axis=1) - middle
-    place, lost = _centroids(light, start)
+    place, lost = _centroids(light, xy[rows] - middle)
     found = rows[~lost]
     refined["x"][found], refined["y"][found] = (place + middle)[~lost].T
     refined["refined"][found] = True

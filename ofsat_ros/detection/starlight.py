@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Star light: what a frame shows beyond the stars, as the other frames show them.
 
 Brightness constancy under the field's motion (Lucas and Kanade's premise, taken over a window of

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Detection: which objects do not move with the star field.
 
 Fifth stage: takes objects, their flow and the field's motion, and returns the RSO candidates of
@@ -14,8 +15,9 @@ from ofsat_ros.star_field import StarFieldMotion
 
 CANDIDATE, CONFIRMED = 0, 1
 # Gaussian width of a point source in the smoothed image, px: a PSF of about 1 and the smoothing.
-_POINT_WIDTH_PX = 1.4
-
+POINT_WIDTH_PX = 1.4
+# What is measured of an object, a spot or a detection alike.
+MEASURED_FIELDS = ("x", "y", "sigma_x", "sigma_y", "snr", "flux", "length", "angle")
 # What only a calibrated camera and an attitude give (`camera`); unknown until then.
 DIRECTION_FIELDS = ("sight", "ra", "dec", "sigma_ra", "sigma_dec")
 
@@ -100,7 +102,10 @@ def detect(
         far = np.hypot(*relative.T) >= min_relative_px
         flagged = flow.valid & (significance > sigmas) & far & ~_at_edge(objects, flow)
         flagged &= ~_was_there(flow, field, relative, previous, current)
-    rows = _one_per_object(np.flatnonzero(flagged), flow.object_index, significance)
+    rows = np.flatnonzero(flagged)
+    # Of several vectors of one object, the most significant.
+    rows = rows[np.argsort(-significance[rows], kind="stable")]
+    rows = np.sort(rows[first_of_each(flow.object_index[rows])])
     return _detections(rows, objects, flow, relative, significance, dt_s)
 
 
@@ -120,7 +125,7 @@ def _was_there(
     """
     now = current.brightness_at(flow.position)
     before = previous.brightness_at(flow.position - field.displacement_at(flow.position))
-    fallen = np.exp(-np.sum(relative**2, axis=1) / (4 * _POINT_WIDTH_PX**2))
+    fallen = np.exp(-np.sum(relative**2, axis=1) / (4 * POINT_WIDTH_PX**2))
     slack = previous.noise + current.noise
     return before > now * (1 + fallen) / 2 - slack
 
@@ -133,15 +138,10 @@ def _at_edge(objects: NDArray[np.void], flow: Flow) -> NDArray[np.bool_]:
     return at_edge
 
 
-def _one_per_object(
-    rows: NDArray[np.intp], object_index: NDArray[np.intp], significance: NDArray[np.float64]
-) -> NDArray[np.intp]:
-    """Of several flagged vectors of one object, the most significant; in their order."""
-    rows = rows[np.argsort(-significance[rows], kind="stable")]
-    owner = object_index[rows]
-    # a vector without object stands for itself
-    owner = np.where(owner >= 0, owner, -1 - rows)
-    return np.sort(rows[np.unique(owner, return_index=True)[1]])
+def first_of_each(object_index: NDArray[np.integer]) -> NDArray[np.intp]:
+    """Rows of the first of several of one object, and of each of none (-1), in their order."""
+    owner = np.where(object_index >= 0, object_index, -1 - np.arange(len(object_index)))
+    return np.sort(np.unique(owner, return_index=True)[1])
 
 
 def _detections(
@@ -160,7 +160,7 @@ def _detections(
     for name in ("snr", "flux", "length", "angle", *DIRECTION_FIELDS):
         found[name] = np.nan
     owned = index >= 0
-    for name in ("x", "y", "sigma_x", "sigma_y", "snr", "flux", "length", "angle"):
+    for name in MEASURED_FIELDS:
         found[name][owned] = objects[name][index[owned]]
     found["vx"], found["vy"] = flow.displacement[rows].T / dt_s
     found["rel_vx"], found["rel_vy"] = relative[rows].T / dt_s

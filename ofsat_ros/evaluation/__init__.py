@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Evaluation: how well detections agree with the truth.
 
 Stands after the result files and beside the benchmarks: takes the truth of a sequence and the

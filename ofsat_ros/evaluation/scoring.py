@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The scoring: truths and detections matched frame by frame, and the figures of it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The tables that are compared, and the files they come from."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Guidance: from tracks to the pointing offset of one target and a rate command for a mount.
 
 Stands behind ``tracking``, like any other reader of ``rso_tracks``, and runs without ROS: a

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The guide: the tracks of each frame in, commands for a mount out."""
 
 from __future__ import annotations
@@ -197,17 +198,17 @@ class Guide:
             self._own.set_rate(now_ns + self._latency_ns, self._rate - learned)
         state, reason = self._words(now_ns, fresh, offset)
         return Command(
-            now_ns,
-            offset,
-            rate,
-            axes(self._rate),
-            self._commanding,
-            self._target.track_id if self._target else 0,
-            state,
-            reason,
-            self._age_s(now_ns),
-            self._limited,
-            self._loop.integral,
+            stamp_ns=now_ns,
+            offset=offset,
+            rate=rate,
+            mount_rate=axes(self._rate),
+            commanding=self._commanding,
+            target_id=self._target.track_id if self._target else 0,
+            state=state,
+            reason=reason,
+            age_s=self._age_s(now_ns),
+            limited=self._limited,
+            integral=self._loop.integral,
         )
 
     @property
@@ -216,12 +217,9 @@ class Guide:
 
         That of the last half second or so: it is fitted over several frames.
         """
-        row = self._seen_row(self._sights)
-        return (
-            np.full(2, np.nan)
-            if self._sights is None or row is None
-            else (self._sights.seen_rate[row])
-        )
+        sights = self._sights
+        row = self._seen_row(sights)
+        return np.full(2, np.nan) if sights is None or row is None else sights.seen_rate[row]
 
     def _seen_row(self, sights: Sights | None) -> int | None:
         """The row that tells our own motion: the target's, else the first there is."""
@@ -345,17 +343,12 @@ class Guide:
         if not fresh:
             return "dead-man", f"{name} was not seen for {age_s:.1f} s"
         at = f"{name}, {np.hypot(*offset) / _ARCSEC:.1f} arcsec off"
-        return (
-            ("coasting", f"{at}, not seen for {age_s:.1f} s")
-            if target.coasting
-            else (
-                "following",
-                at,
-            )
-        )
+        if target.coasting:
+            return "coasting", f"{at}, not seen for {age_s:.1f} s"
+        return "following", at
 
     def _why_none(self) -> str:
         given = self._parameters
-        wanted = f"track {given.target_id} is" if given.target == "id" else "there is"
-        wanted += " not there" if given.target == "id" else " no track"
+        by_id = given.target == "id"
+        wanted = f"track {given.target_id} is not there" if by_id else "there is no track"
         return f"{self._lost_why}; {wanted}" if self._lost_why else wanted

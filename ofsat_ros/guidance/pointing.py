@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The control law: dead reckoning of the mount, PI on the offset, limits.
 
 Vectors of two are (right, down) in the optical frame: rad of offset, rad/s of the boresight's

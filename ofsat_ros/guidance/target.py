@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Which track is the target: choice, and the same object again after a gap."""
 
 from __future__ import annotations
@@ -77,11 +78,6 @@ class Sights:
         (rows,) = np.nonzero(self.tracks["track_id"] == track_id)
         return int(rows[0]) if len(rows) else None
 
-    @property
-    def ids(self) -> set[int]:
-        """Numbers of all tracks."""
-        return {int(number) for number in self.tracks["track_id"]}
-
 
 @dataclass(frozen=True)
 class Target:
@@ -136,14 +132,14 @@ def found(sights: Sights, row: int) -> Target:
     """Return the target that a row shows for the first time."""
     track = sights.tracks[row]
     return Target(
-        int(track["track_id"]),
-        sights.stamp_ns,
-        sights.sight[row],
-        sights.omega[row],
-        sights.stamp_ns,
-        sights.stamp_ns,
-        frozenset(sights.ids),
-        np.zeros(3),
+        track_id=int(track["track_id"]),
+        stamp_ns=sights.stamp_ns,
+        sight=sights.sight[row],
+        omega=sights.omega[row],
+        seen_ns=sights.stamp_ns,
+        since_ns=sights.stamp_ns,
+        beside=frozenset(sights.tracks["track_id"].tolist()),
+        alpha=np.zeros(3),
         coasting=bool(track["status"] == COASTING),
     )
 

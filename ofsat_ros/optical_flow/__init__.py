@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Optical flow: how far each object moved between the previous frame and the current one.
 
 Two Lucas-Kanade engines behind one interface, both of AAS 21-364: ``SparseLucasKanade``

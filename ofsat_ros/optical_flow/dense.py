@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The dense engine: Lucas-Kanade at every pixel, by its derivatives."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What goes into the flow engines and what comes out of them."""
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ofsat_ros.pixels import Regions
+from ofsat_ros.pixels import Regions, inside
 
 Array = NDArray[np.float64]
 Plane = NDArray[np.float32]
@@ -76,7 +77,7 @@ class FlowInput:
         -------
         (N,) float64
         """
-        # cv2.remap would end at 32,767 points
+        # cv2.remap knows 32nds of a pixel only
         limit = np.array(self.smoothed.shape[::-1]) - 1
         near = np.clip(xy, 0, limit)
         x, y = np.minimum(near.astype(np.intp), limit - 1).T
@@ -87,8 +88,7 @@ class FlowInput:
 
     def contains(self, xy: Array) -> NDArray[np.bool_]:
         """Whether points (N, 2) lie inside the image, (N,)."""
-        height, width = self.smoothed.shape
-        return np.all((xy >= 0) & (xy <= [width - 1, height - 1]), axis=1)
+        return inside(xy, self.smoothed.shape)
 
     def object_at(self, xy: Array) -> NDArray[np.intp]:
         """Index of the object at points (N, 2) inside the image, (N,); -1 for none."""

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The one table of parameters: name, default, range, unit, meaning.
 
 Everything else that shows a parameter derives from it: ROS descriptors (``nodes``), the presets'

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The parameters of the nodes, of the camera, and of what is written."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The parameters of the pipeline's stages, and their presets."""
 
 from __future__ import annotations

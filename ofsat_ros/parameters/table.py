@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What a parameter is: a field of a frozen dataclass with default, range, unit and meaning.
 
 The machinery under the tables of this package: whoever adds a parameter adds a field to a table

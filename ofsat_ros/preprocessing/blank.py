@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Images in which nothing can be seen: what they are like, in words for the observer."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Defects of the sensor: pixels that shine without light.
 
 One that stands alone too sharply shows in a single frame (`sharp_pixels`); one that is too faint

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Meshes: background and noise on a grid of equal cells over the image.
 
 Statistics of a subsample: 256 values of a cell at least tell its level to 3 % of the noise of one

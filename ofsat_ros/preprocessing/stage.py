@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Background, Gaussian smoothing and threshold: the first stage, from image to what is bright.
 
 As published (AAS 21-364): the image is smoothed by a Gaussian to I_s, the threshold is
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from ofsat_ros.parallel import buffer, in_parallel
 from ofsat_ros.parameters import Parameters
-from ofsat_ros.pixels import rows_and_columns
+from ofsat_ros.pixels import SPOT_PIXEL_SIGMAS, rows_and_columns
 from ofsat_ros.preprocessing import mesh as meshes
 from ofsat_ros.preprocessing.defects import AROUND, SensorMemory, beside, sharp_pixels
 from ofsat_ros.preprocessing.mesh import BackgroundMap
@@ -39,8 +40,6 @@ _FLAT_SAMPLES, _LEAST_FLAT, _FAR_STEPS, _FLAT_PX = 128, 8, 4.0, 5
 _FILL_SAMPLES = 2**16
 # Side of the square around a pixel without sky in which smoothing has spread that, px.
 _BLIND_PX = 11
-# Spots are made of pixels above this many sigmas.
-SPOT_PIXEL_SIGMAS = 2.5
 # White noise keeps a third of itself when smoothed, what has structure nearly all: above this part
 # of it, most of the image is structure, be it clouds or a sensor's bands.
 _VEIL_RATIO, _WHITE_RATIO = 0.9, 0.5
@@ -136,7 +135,6 @@ def preprocess(
         Those of the stage ``preprocessing``.
     memory : SensorMemory, optional
         What was learned of the sensor from the images before; this one is added to it.
-
     out : (H, W) float32, optional
         Where to put the smoothed image; an array of another shape is left alone.
 
@@ -149,39 +147,15 @@ def preprocess(
     ValueError
         If no pixel is finite and below 1e15.
     """
-    image, blind = _finite(raw)
-    rounding = _rounding_noise(image)
-    flat = _flat(image, rounding * math.sqrt(12)) if blind is None else None
-    blind = flat if blind is None else blind
-    if blind is not None:
-        image = _filled(image, blind)
-        blind = _around(blind)
-    cell = parameters.background_cell_px if parameters.background == "mesh" else max(raw.shape)
-    # A mesh needs a frame of cells to interpolate between; a small image is one cell.
-    mesh = (max(1, round(raw.shape[0] / cell)), max(1, round(raw.shape[1] / cell)))
-    # Means of four pixels have half the noise of one.
-    values = meshes.cells(image, mesh, exact=False)
-    level, _ = meshes.statistics(values, mesh, rounding, reach=2.0)
-    # Without a mesh it is one number, whose subtraction changes no threshold.
+    image, blind, rounding = _seen(raw)
+    mesh, level, pixel_noise = _background(image, rounding, parameters)
     levels = BackgroundMap(level, image.shape)
     background = float(np.median(level))
-    pixel_noise = _pixel_noise(image, mesh, level, rounding)
     smoothed = np.empty(raw.shape, np.float32) if out is None or out.shape != raw.shape else out
     replaced, defects = _smooth(image, levels, pixel_noise, parameters, memory, smoothed)
 
-    sigma = parameters.smoothing_sigma_px
-    floor = rounding * _white_ratio(sigma)
-    count = parameters.threshold_sigmas
-    if parameters.threshold_statistics == "all":
-        mean, std = (float(v[0, 0]) for v in cv2.meanStdDev(smoothed))
-        noise, ratio = max(std, floor), np.ones((1, 1), np.float32)
-        limit = np.full((1, 1), mean + count * noise, np.float32)
-    else:
-        mean_mesh, noise_mesh = meshes.statistics(meshes.cells(smoothed, mesh), mesh, floor)
-        noise = float(np.median(noise_mesh))
-        ratio = noise_mesh / np.float32(noise)
-        limit = mean_mesh + np.float32(count) * noise_mesh
-    white = _white_ratio(sigma)
+    white = _white_ratio(parameters.smoothing_sigma_px)
+    limit, noise, ratio = _threshold(smoothed, mesh, rounding * white, parameters)
     local = parameters.threshold_statistics == "clipped" and white < _WHITE_RATIO
     bright, light = _bright_pixels(smoothed, np.minimum(limit, SPOT_PIXEL_SIGMAS * noise * ratio))
     return Preprocessed(
@@ -201,6 +175,61 @@ def preprocess(
         _levels=levels,
         _replaced=replaced,
     )
+
+
+def learn(raw: NDArray[np.generic], parameters: Parameters, memory: SensorMemory) -> None:
+    """Add an image to what is known of the sensor, as `preprocess` does, and do no more.
+
+    Parameters and what is raised are those of `preprocess`.
+    """
+    image, _, rounding = _seen(raw)
+    if parameters.hot_pixels == "replace":
+        _, level, pixel_noise = _background(image, rounding, parameters)
+        _learn(memory, image, BackgroundMap(level, image.shape), pixel_noise)
+
+
+def _seen(
+    raw: NDArray[np.generic],
+) -> tuple[NDArray[np.generic], NDArray[np.bool_] | None, float]:
+    """The image with background where there is no sky, where that is, the noise of rounding."""
+    image, blind = _finite(raw)
+    rounding = _rounding_noise(image)
+    if blind is None:
+        blind = _flat(image, rounding * math.sqrt(12))
+    if blind is None:
+        return image, None, rounding
+    return _filled(image, blind), _around(blind), rounding
+
+
+def _background(
+    image: NDArray[np.generic], rounding: float, parameters: Parameters
+) -> tuple[tuple[int, int], Image, float]:
+    """Cells of the background's mesh, its levels there, and the std of pixels beside it."""
+    height, width = image.shape
+    cell = parameters.background_cell_px if parameters.background == "mesh" else max(image.shape)
+    # A mesh needs a frame of cells to interpolate between; a small image is one cell.
+    mesh = (max(1, round(height / cell)), max(1, round(width / cell)))
+    # Means of four pixels have half the noise of one.
+    values = meshes.cells(image, mesh, exact=False)
+    # Without a mesh it is one number, whose subtraction changes no threshold.
+    level, _ = meshes.statistics(values, mesh, rounding, reach=2.0)
+    return mesh, level, _pixel_noise(image, mesh, level, rounding)
+
+
+def _threshold(
+    smoothed: Image, mesh: tuple[int, int], floor: float, parameters: Parameters
+) -> tuple[Image, float, Image]:
+    """Mesh of the thresholds, DN; the noise, DN, at least `floor`; and its mesh over that."""
+    count = parameters.threshold_sigmas
+    if parameters.threshold_statistics == "all":
+        mean, std = (float(v[0, 0]) for v in cv2.meanStdDev(smoothed))
+        noise = max(std, floor)
+        limit = np.full((1, 1), mean + count * noise, np.float32)
+        return limit, noise, np.ones((1, 1), np.float32)
+    mean_mesh, noise_mesh = meshes.statistics(meshes.cells(smoothed, mesh), mesh, floor)
+    noise = float(np.median(noise_mesh))
+    limit = mean_mesh + np.float32(count) * noise_mesh
+    return limit, noise, noise_mesh / np.float32(noise)
 
 
 def _above(bright: Index, light: Image, limit: Image, shape: tuple[int, ...]) -> Index:

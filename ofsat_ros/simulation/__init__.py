@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Frames of a simulated telescope camera, with the truth of what is in them.
 
 It stands at the start of the flow, in the place of a camera, and knows no other stage: tests,

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """How a frame is made of what a camera sees, whatever it looks at and however it moves.
 
 It stands between the geometry, which is that of a plane (`plane`) or of the sphere (`sphere`) and

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What a simulated frame is: an image, and the truth of what is in it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """How a camera turns over the sky: motions for `SphereSimulator`, and a mount that obeys commands.
 
 An attitude is the rotation ICRS -> optical frame (x right, y down, z forward): it turns

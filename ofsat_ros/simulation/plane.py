@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """A sky that is a plane: stars without end, a camera that drifts over it, RSOs at even rates."""
 
 from __future__ import annotations
@@ -121,11 +122,6 @@ class SkySimulator(Simulator):
         Of the mount, which knows nothing of the jitter.
         """
         return float(self._pose.pointing.real), float(self._pose.pointing.imag)
-
-    @property
-    def field_angle_rad(self) -> float:
-        """Turn of the field from the start to when the next exposure begins, rad."""
-        return float(self._pose.angle)
 
     def _look(self, start_s: float) -> View:
         s, seconds = self.settings, self._instants()

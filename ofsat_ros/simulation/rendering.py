@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """How the light of point sources falls on the pixels.
 
 It is the first step of a frame; `sky` and `sensor` act on what it gives.  Light is here and there
@@ -16,7 +17,7 @@ from ofsat_ros.simulation.settings import SimulatorSettings
 _PSF_REACH_SIGMAS = 5
 _PATCH_PIXELS_AT_ONCE = 2_000_000
 
-# Of the standard library, and quick enough here: it spares the package SciPy.
+# The last bits of SciPy's are others, and the same settings are to give the same bytes.
 _erf = np.frompyfunc(math.erf, 1, 1)
 
 

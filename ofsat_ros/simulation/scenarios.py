@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Named scenarios: settings and RSOs that show one case each."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The sensor behind the telescope: vignetting, its pixels' defects, its noise.
 
 It is the last step of a frame: from the light that arrives to the image, and to the SNR that a

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What the simulator simulates: settings, checked, and the random streams that they seed."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The sky between the sources and the telescope: clouds, and light of its own.
 
 It stands between the light of the stars and RSOs (`rendering`) and the sensor: what a cloud lets

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The whole celestial sphere: stars all over it, RSOs by their directions, a camera that turns."""
 
 from __future__ import annotations

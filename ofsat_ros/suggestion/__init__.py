@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Suggestion: what a recording is like, and the parameters that suit it.
 
 Stands beside ``processing``: it runs the same `Pipeline` over the first frames of a recording,

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """From what was measured to parameters, each with its reason.
 
 The rules are measured on simulated scenes with another PSF, rate or sensor each (docs/optics.md

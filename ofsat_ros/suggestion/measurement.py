@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What the frames of a recording are like: stars, noise, motion, rate."""
 
 from __future__ import annotations

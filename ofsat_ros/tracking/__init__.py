@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Tracking: spots over time become tracks.
 
 Sixth stage: takes the history and what ``detection`` found in its frames, and says which of it is

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Assignment: which of a frame's spots and objects is which track's."""
 
 from __future__ import annotations
@@ -7,17 +8,16 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ofsat_ros.detection import SPOT_DTYPE
+from ofsat_ros.detection import MEASURED_FIELDS, SPOT_DTYPE
 from ofsat_ros.history import PastFrame
-from ofsat_ros.tracking.sightings import Sighting, as_complex
+from ofsat_ros.pixels import as_complex, positions
+from ofsat_ros.tracking.sightings import SPREAD_PX, Sighting
 from ofsat_ros.tracking.track import Track, covariances, predict
 
 Array = NDArray[np.float64]
 
 # A spot this far from where a track is expected, in sigmas, is not its.
 _GATE_SIGMAS = 4.0
-# Beside the track's own uncertainty, px: what noise moves a faint spot by.
-_SPREAD_PX = 0.35
 # An object may be a slow track's sight; a fast track would take a star for it, px per frame.
 SLOW_PX = 2.0
 _FLUX_RATIO = 3.0
@@ -55,7 +55,7 @@ def as_spots(frame: PastFrame, rows: Sequence[int] | NDArray[np.intp]) -> NDArra
     """Objects of a frame as if they were spots."""
     objects = frame.objects[rows]
     spots = np.zeros(len(objects), SPOT_DTYPE)
-    for name in ("x", "y", "sigma_x", "sigma_y", "snr", "flux", "length", "angle"):
+    for name in MEASURED_FIELDS:
         spots[name] = objects[name]
     spots["excess"], spots["object_index"] = objects["snr"], rows
     return spots
@@ -89,8 +89,8 @@ def _candidates(
     row = np.concatenate([row, slow_row[which]])
     number = np.concatenate([number, len(sighting.spots) + rest[column]])
 
-    off = frame.sky(np.stack([spots["x"], spots["y"]], axis=1)) - expected[row]
-    spread = spread[row, :2, :2] + covariances(frame, spots) + _SPREAD_PX**2 * np.eye(2)
+    off = frame.sky(positions(spots)) - expected[row]
+    spread = spread[row, :2, :2] + covariances(frame, spots) + SPREAD_PX**2 * np.eye(2)
     distance = np.sum(off * np.linalg.solve(spread, off[:, :, None])[:, :, 0], axis=1)
     flux, length = (
         np.array([getattr(track, name) for track in tracks])[row] for name in ("flux", "length")

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The last word on each frame, held back until it is known what becomes of its tracks."""
 
 from __future__ import annotations

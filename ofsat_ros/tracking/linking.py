@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Linking: which spots of several frames lie on one straight path that chance does not explain.
 
 Noise gives every frame some spots.  Of a path through spots one can say how many such paths the
@@ -16,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ofsat_ros.detection import BORDER_PX
 from ofsat_ros.tracking.sightings import Places, Sighting, Vicinity
 
 Array = NDArray[np.float64]
@@ -33,8 +35,6 @@ _BRIGHTNESS_RATIO = 5.0
 # A near partner is less likely chance's than a far one: its number goes with the area, down to
 # this part of it, since artefacts keep together.
 _SCALES, _LEAST_AREA = 8, 0.25
-# A path is not looked for nearer to the border, px.
-_BORDER_PX = 3.5
 # The least way on the sky that is motion, px.
 _LEAST_WAY_PX = 2.0
 
@@ -195,7 +195,7 @@ class _Lines:
 
 def _part(one: Sighting, other: Sighting, third: Sighting) -> float:
     """Where between the times of the first two, 0 and 1, that of the third is."""
-    return _seconds(third, one) / _seconds(other, one)
+    return third.frame.seconds_since(one.frame) / other.frame.seconds_since(one.frame)
 
 
 def _line_gate(one: Sighting, other: Sighting, third: Sighting) -> float:
@@ -215,7 +215,7 @@ class _Paths:
     def __init__(self, newest: Sighting, other: Sighting, a: Rows, b: Rows) -> None:
         self._newest = newest
         self._rows = {newest.frame.number: a, other.frame.number: b}
-        t = _seconds(other, newest)
+        t = other.frame.seconds_since(newest.frame)
         self.count = np.full(len(a), 2.0)
         self._t, self._tt = np.full(len(a), t), np.full(len(a), t * t)
         self._xy = newest.places[a] + other.places[b]
@@ -272,7 +272,7 @@ class _Paths:
 
     def extend(self, other: Sighting) -> None:
         """Add to each path the spot of another frame that is nearest to it, if one is near."""
-        t = _seconds(other, self._newest)
+        t = other.frame.seconds_since(self._newest.frame)
         expected = self._origin + t * self._velocity
         rows = np.full(len(expected), -1, np.intp)
         self._rows[other.frame.number] = rows
@@ -336,8 +336,8 @@ def _is_visible(other: Sighting, places: Places) -> NDArray[np.bool_]:
     (xx, xy, x0), (yx, yy, y0) = other.frame.from_sky[:2].tolist()
     x, y = np.ascontiguousarray(places.real), np.ascontiguousarray(places.imag)
     column, row = xx * x + xy * y + x0, yx * x + yy * y + y0
-    inside = (column >= _BORDER_PX) & (column <= width - 1 - _BORDER_PX)
-    return inside & (row >= _BORDER_PX) & (row <= height - 1 - _BORDER_PX)
+    inside = (column >= BORDER_PX) & (column <= width - 1 - BORDER_PX)
+    return inside & (row >= BORDER_PX) & (row <= height - 1 - BORDER_PX)
 
 
 def _nearest(other: Sighting, places: Places, gate: Array) -> tuple[Rows, Rows, Array]:
@@ -354,7 +354,3 @@ def _nearest(other: Sighting, places: Places, gate: Array) -> tuple[Rows, Rows, 
     # What belongs to one place is together.
     best = best[np.flatnonzero(np.diff(i.take(best), prepend=-1))]
     return i.take(best), spot.take(best), distance.take(best)
-
-
-def _seconds(other: Sighting, newest: Sighting) -> float:
-    return (other.frame.stamp_ns - newest.frame.stamp_ns) / 1e9

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What tracks tell others: rows of detections and of tracks, in pixels of a frame."""
 
 from __future__ import annotations
@@ -8,7 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ofsat_ros.detection import CONFIRMED, DETECTION_DTYPE, DIRECTION_FIELDS, SPOT_DTYPE
+from ofsat_ros.detection import (
+    CONFIRMED,
+    DETECTION_DTYPE,
+    DIRECTION_FIELDS,
+    MEASURED_FIELDS,
+    SPOT_DTYPE,
+)
 from ofsat_ros.history import History, PastFrame
 from ofsat_ros.tracking.track import Track, predict
 
@@ -92,7 +99,7 @@ def _rows(
     if not tracks:
         return rows
     spots = np.array([track.hits[frame.number].spot for track in tracks], SPOT_DTYPE)
-    for name in ("x", "y", "sigma_x", "sigma_y", "snr", "flux", "length", "angle"):
+    for name in MEASURED_FIELDS:
         rows[name] = spots[name]
     _set_velocities(rows, states, frame, history)
     for name in DIRECTION_FIELDS:
@@ -127,7 +134,7 @@ def track_rows(tracks: Sequence[Track], history: History) -> NDArray[np.void]:
         rows[name] = np.nan
     rows["age"] = [(frame.stamp_ns - track.born_ns) / 1e9 for track in tracks]
     rows["hits"] = [track.hit_count for track in tracks]
-    rows["misses"] = [track.missed for track in tracks]
+    rows["misses"] = [track.misses for track in tracks]
     rows["log_false"] = [track.log_false for track in tracks]
     rows["track_id"] = [track.track_id for track in tracks]
     seen = [frame.number in track.hits for track in tracks]
@@ -150,7 +157,7 @@ def _image_velocities(states: Array, frame: PastFrame, history: History) -> Arra
     from frame to frame, but goes nowhere.
     """
     near = sorted(history, key=lambda other: abs(other.number - frame.number))[:_FIT_FRAMES]
-    t = np.array([(other.stamp_ns - frame.stamp_ns) / 1e9 for other in near])
+    t = np.array([other.seconds_since(frame) for other in near])
     off = t - t.mean()
     # The fit is linear in the places, and these are in the states.
     matrices = np.array([other.from_sky[:2] for other in near])

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Sharpness: what keeps to its place in the sensor and is sharper than the stars is a defect.
 
 A pixel, a column or a few pixels that begin to shine do what an RSO does that the camera follows.
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ofsat_ros.history import PastFrame
+from ofsat_ros.pixels import positions
 
 Array = NDArray[np.float64]
 
@@ -60,7 +62,7 @@ def _left_of_stars(frame: PastFrame) -> float:
     rows = np.flatnonzero((objects["snr"] > _STAR_SNR) & ~objects["edge"])[:_MOST_STARS]
     if len(rows) < _LEAST_STARS:
         return 0.0
-    xy = np.stack([objects["x"], objects["y"]], axis=1)[rows]
+    xy = positions(objects)[rows]
     # Across a streak.
     angle = objects["angle"][rows] + np.pi / 2
     way = _BESIDE_PX * np.stack([np.cos(angle), np.sin(angle)], axis=1)

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Sightings: the spots of one frame, with what linking asks of them many times.
 
 Which of them are near to a place, which tell something, and how many such spots chance gives.
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ofsat_ros.history import PastFrame
+from ofsat_ros.pixels import as_complex, positions
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
@@ -28,9 +30,9 @@ _FEW_PAIRS = 1 << 14
 # The map of where spots are has smaller cells, and marks so many on each side of a spot's own.
 _FINE_PX, _FINE_REACH = 2.0, 4
 # Std of a spot's place beside its stated one, px: what position a spot of low SNR takes by chance.
-_SPREAD_PX = 0.35
+SPREAD_PX = 0.35
 # The end of a streak is as good as its middle: its place is uncertain by this part of its length.
-_STREAK_SPREAD = 0.12
+STREAK_SPREAD = 0.12
 # How far around a spot others are counted, px.
 _NEARBY_PX = 40.0
 # A spot that the frame before shows this near to its place on the sky is a star that changed, or
@@ -219,7 +221,7 @@ class Sighting:
         cls, frame: PastFrame, spots: NDArray[np.void], before: Sighting | None = None
     ) -> Sighting:
         """Build with all spots free, given those of the frame before."""
-        sky = frame.sky(np.stack([spots["x"], spots["y"]], axis=1))
+        sky = frame.sky(positions(spots))
         telling = spots["clean"].copy()
         if before is not None:
             reach = np.full(len(sky), _REPEATED_PX)
@@ -312,11 +314,6 @@ class Sighting:
                 yield i, rows, np.abs(places.take(i) - self.places.take(rows))
 
 
-def as_complex(xy: Array) -> Places:
-    """Places (N, 2) as complex numbers, (N,)."""
-    return xy[:, 0] + 1j * xy[:, 1]
-
-
 def spread(length: Array) -> Array:
     """Std of a place beside its stated one, given the length of what is there, px."""
-    return np.sqrt(_SPREAD_PX**2 + (_STREAK_SPREAD * length) ** 2)
+    return np.sqrt(SPREAD_PX**2 + (STREAK_SPREAD * length) ** 2)

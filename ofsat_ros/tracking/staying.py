@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What stays at its place on the sky is a star, however new it looked.
 
 A star that comes out of a cloud, from behind a dome or beside a masked part of the image shines
@@ -12,14 +13,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ofsat_ros.detection import BORDER_PX
+from ofsat_ros.detection import BORDER_PX, POINT_WIDTH_PX
 from ofsat_ros.history import PastFrame
+from ofsat_ros.pixels import positions
 
 Array = NDArray[np.float64]
 
-# Gaussian width of a point source in the smoothed image, px, and the least way after which it can
-# be told whether its light has gone.
-_WIDTH_PX, _LEAST_WAY_PX = 1.4, 2.0
+# The least way after which it can be told whether a point's light has gone, px.
+_LEAST_WAY_PX = 2.0
 # How surely that must be told, in sigmas of the noise.
 _SURE_SIGMAS = 2.0
 # What moves is seen at so many places at least.
@@ -53,7 +54,7 @@ def moves_on(
     time = np.zeros(len(spots))
     for n, frame in frames.items():
         rows = np.flatnonzero(number == n)
-        xy = np.stack([spots["x"], spots["y"]], axis=1)[rows]
+        xy = positions(spots)[rows]
         sky[rows] = frame.sky(xy)
         new[rows] = spots["excess"][rows] * frame.noise_at(np.rint(xy).astype(np.intp))
         star[rows] = np.maximum(frame.light_at(xy) - new[rows], 0)
@@ -63,7 +64,7 @@ def moves_on(
     for n, frame in frames.items():
         way = speed * (frame.stamp_ns / 1e9 - time) - spots["length"] / 2
         # How much of a point source is left beside it.
-        least = np.exp(-(np.maximum(way, 0) ** 2) / (4 * _WIDTH_PX**2))
+        least = np.exp(-(np.maximum(way, 0) ** 2) / (4 * POINT_WIDTH_PX**2))
         told = (number < n) & (way > _LEAST_WAY_PX)
         told &= (1 - least) / 2 * spots["excess"] > _SURE_SIGMAS
         rows = np.flatnonzero(told)

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Tracks: the hits of an RSO and a constant-velocity Kalman filter in the sky plane.
 
 The filter works on all tracks at once: a matrix of one track costs as much as those of a hundred.
@@ -16,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ofsat_ros.history import PastFrame
+from ofsat_ros.pixels import positions
+from ofsat_ros.tracking.sightings import STREAK_SPREAD
 
 Array = NDArray[np.float64]
 
@@ -23,8 +26,8 @@ Array = NDArray[np.float64]
 _MANOEUVRE, _WANDER_PX = 0.01, 0.02
 # What a centroid is off by beside its stated std: the pixel grid, blends, px.
 _FLOOR_PX = 0.05
-# Along a streak, a centroid may be off by this part of its length, and once refined by this.
-_STREAK_SPREAD, _REFINED_SPREAD = 0.12, 0.01
+# Along a streak, a refined centroid may be off by this part of its length.
+_REFINED_SPREAD = 0.01
 # Hits over which a velocity is fitted, and over which a track must have moved.
 _FIT_HITS, _WAY_HITS = 9, 5
 # What stays within this way on the sky is a star, px; nor is it motion if it may be chance.
@@ -71,7 +74,7 @@ class Hit:
     @classmethod
     def of_all(cls, frame: PastFrame, spots: NDArray[np.void]) -> list[Hit]:
         """Build from spots (N,) of a frame."""
-        sky = frame.sky(np.stack([spots["x"], spots["y"]], axis=1))
+        sky = frame.sky(positions(spots))
         parts = zip(spots, sky, covariances(frame, spots), strict=True)
         return [cls(frame.number, frame.stamp_ns, *part) for part in parts]
 
@@ -88,7 +91,7 @@ class Hit:
 
 def covariances(frame: PastFrame, spots: NDArray[np.void]) -> Array:
     """Covariances of the places of spots (N,) of a frame in the sky plane, (N, 2, 2) px^2."""
-    along = np.where(spots["refined"], _REFINED_SPREAD, _STREAK_SPREAD) * spots["length"]
+    along = np.where(spots["refined"], _REFINED_SPREAD, STREAK_SPREAD) * spots["length"]
     along_x, along_y = along * np.cos(spots["angle"]), along * np.sin(spots["angle"])
     own = np.empty((len(along), 2, 2))
     own[:, 0, 0] = spots["sigma_x"] ** 2 + along_x**2 + _FLOOR_PX**2
@@ -117,9 +120,9 @@ class Track:
     born_ns : int
         Stamp of the first hit.
     misses : int
-        Frames since the last sure hit in which it was not surely seen.
-    missed : int
-        All frames in which it was expected and not seen.
+        Frames in which it was expected and not seen.
+    unsure : int
+        Frames since the last sure hit in which it was expected: not seen, or only faintly.
     stamp_ns : int
         Time of the state, ns UTC.
     state : (4,) float64
@@ -136,7 +139,7 @@ class Track:
     born_hits: int = 0
     born_ns: int = 0
     misses: int = 0
-    missed: int = 0
+    unsure: int = 0
     stamp_ns: int = 0
     state: Array = field(default_factory=lambda: np.zeros(4))
     covariance: Array = field(default_factory=lambda: np.eye(4))
@@ -158,7 +161,7 @@ class Track:
     def go_on_from(self, before: Track) -> None:
         """Be the same RSO as a track that has ended; where both have a hit, its own counts."""
         self.track_id, self.born_ns = before.track_id, before.born_ns
-        self.missed += before.missed
+        self.misses += before.misses
         new = sum(number not in before.hits for number in self.hits)
         self.hit_count = self.born_hits = before.hit_count + new
         self.hits = {**before.hits, **self.hits}
@@ -184,7 +187,7 @@ class Track:
     def is_sustained(self, log_limit: float) -> bool:
         """Whether it is still no chance when hits and misses since its birth are counted."""
         later = self.hit_count - self.born_hits
-        balance = max(self.missed, self.misses) - later
+        balance = max(self.misses, self.unsure) - later
         return self.log_false + _MISS_LOG * balance < log_limit
 
     def _line(self, hits: Sequence[Hit]) -> tuple[Array, float]:

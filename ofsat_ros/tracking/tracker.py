@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The tracker: spots over time become tracks with ids that stay.
 
 Frame by frame: tracks take the spots where they are expected (assignment by the statistical
@@ -16,12 +17,13 @@ from numpy.typing import NDArray
 
 from ofsat_ros.detection import BORDER_PX, CANDIDATE, CONFIRMED, DETECTION_DTYPE, SPOT_DTYPE, Drift
 from ofsat_ros.history import History, PastFrame
+from ofsat_ros.pixels import as_complex, positions
 from ofsat_ros.tracking.assignment import SLOW_PX, as_spots, assign
 from ofsat_ros.tracking.last_word import LastWord
 from ofsat_ros.tracking.linking import find_links
 from ofsat_ros.tracking.rows import TRACK_DTYPE, Settled, detection_rows, track_rows
 from ofsat_ros.tracking.sharpness import is_sharper_than_stars
-from ofsat_ros.tracking.sightings import Sighting, as_complex
+from ofsat_ros.tracking.sightings import Sighting
 from ofsat_ros.tracking.staying import moves_on
 from ofsat_ros.tracking.track import Hit, Track, add_hits, places, predict
 
@@ -183,26 +185,26 @@ class Tracker:
         frame, sighting = history[-1], self._sightings[-1]
         inside = frame.contains(places(self._tracks, frame))
         rows, spots = assign(self._tracks, frame, sighting)
-        taken = list(np.stack([spots["x"], spots["y"]], axis=1))
+        taken = list(positions(spots))
         sure = [self._tracks[row] for row in rows]
         hits = self._refined(sure, frame, history, spots)
         add_hits(sure, hits)
         for track in sure:
-            track.misses = 0
+            track.unsure = 0
         for row in sorted(set(np.flatnonzero(inside)) - set(rows)):
             # What only a closer look finds keeps the track where it is, but not alive.
             track = self._tracks[row]
-            track.misses += 1
+            track.unsure += 1
             hit = self._closer_look(track, frame, history, taken)
             if hit is None:
-                track.missed += 1
+                track.misses += 1
             else:
                 add_hits([track], [hit])
                 hits.append(hit)
         kept = []
         for track, seen in zip(self._tracks, inside, strict=True):
             star = track.stands_still()
-            if seen and track.misses <= coast_frames and not star:
+            if seen and track.unsure <= coast_frames and not star:
                 kept.append(track)
             elif track.is_sustained(log_limit) and not star:
                 self._ended.append(track)
@@ -278,17 +280,11 @@ class Tracker:
         """Tracks that chance does not explain, and candidates, which it hardly explains."""
         frames = {frame.number: frame for frame in history}
         sightings = {sighting.frame.number: sighting for sighting in self._sightings}
-        links = find_links(self._sightings, log_limit + _CANDIDATE_LOG, max_speed_px)
-        paths = [{n: sightings[n].spots[row] for n, row in link.rows.items()} for link in links]
         finds = [
             (drift.log_false, {n: as_spots(frames[n], [row]) for n, row in drift.rows.items()})
             for drift in drifts
         ]
-        finds += [
-            (link.log_false, {n: np.array([spot], SPOT_DTYPE) for n, spot in path.items()})
-            for link, path, moves in zip(links, paths, moves_on(paths, frames), strict=True)
-            if moves
-        ]
+        finds += self._paths(frames, sightings, log_limit, max_speed_px)
         born: list[Track] = []
         candidates: list[Track] = []
         for log_false, spots in finds:
@@ -316,6 +312,22 @@ class Tracker:
             for number in track.hits.keys() & sightings.keys():
                 _take(sightings[number], [track.hits[number]])
         return born, candidates
+
+    def _paths(
+        self,
+        frames: dict[int, PastFrame],
+        sightings: dict[int, Sighting],
+        log_limit: float,
+        max_speed_px: float,
+    ) -> list[tuple[float, dict[int, NDArray[np.void]]]]:
+        """How many times chance gives each path (logarithm), and its spots by frame, (1,)."""
+        links = find_links(self._sightings, log_limit + _CANDIDATE_LOG, max_speed_px)
+        paths = [{n: sightings[n].spots[row] for n, row in link.rows.items()} for link in links]
+        return [
+            (link.log_false, {n: np.array([spot], SPOT_DTYPE) for n, spot in path.items()})
+            for link, path, moves in zip(links, paths, moves_on(paths, frames), strict=True)
+            if moves
+        ]
 
     def _name(self, track: Track) -> None:
         """Give a new track its id: that of the track that had ended where it begins, if one has.
@@ -346,14 +358,14 @@ def _hidden(
     tracks: Sequence[Track], frame: PastFrame, history: History, reach_px: float
 ) -> NDArray[np.bool_]:
     """Which other frames show N tracks themselves at their places in a frame, (F, N)."""
-    ages = np.array([abs(o.stamp_ns - frame.stamp_ns) / 1e9 for o in history.others(frame)])
+    ages = np.array([abs(other.seconds_since(frame)) for other in history.others(frame)])
     speeds = np.array([track.speed for track in tracks])
     return ages[:, None] * speeds <= reach_px
 
 
 def _frame_seconds(history: History) -> float:
     """Mean time between the frames, s."""
-    return (history[-1].stamp_ns - history[0].stamp_ns) / 1e9 / max(1, len(history) - 1)
+    return history[-1].seconds_since(history[0]) / max(1, len(history) - 1)
 
 
 def _is_still(hits: dict[int, Hit]) -> bool:

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Tracking data: the directions of tracks as files that orbit determination reads.
 
 Stands after the detections have got their directions: the command ``ofsat process --tdm`` and the

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Arcs: the directions of one object in a row, taken apart by the number of their track."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Files of tracking data: what is in them, and how they appear whole or not at all."""
 
 from __future__ import annotations
@@ -181,8 +182,10 @@ def _write_whole(path: Path, text: str, force: bool) -> None:
             os.replace(part, path)
         else:
             _move_to_free(part, path)
-    except BaseException:
+    except BaseException as error:
         part.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno:  # as of a disk that is full
+            error.filename = f"{path}"
         raise
 
 

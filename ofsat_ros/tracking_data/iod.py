@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Lines in the IOD format, as observers of satellites send them to SeeSat-L.
 
 Follows the IOD Observation Format Description (G. D. Lewis, 1998, clarified 2002): one direction

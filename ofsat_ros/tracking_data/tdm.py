@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """CCSDS Tracking Data Messages of right ascension and declination (503.0-B-2, June 2020).
 
 `tdm_kvn` and `tdm_xml` write the same message, as "keyword = value" text (section 4) and as XML
