@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What the nodes do with images over DDS: overhead, losses, latency, start, several cameras.
 
 ``python -m benchmarks.throughput`` prints a Markdown table.  Senders and detectors are processes
@@ -36,7 +37,8 @@ from std_msgs.msg import Header
 
 from benchmarks.speed import HEADLINE, Sky, alone, load, machine, render
 from ofsat_ros.nodes import messages, player
-from ofsat_ros.nodes.runtime import parser_of, prepare_for_large_images, reliable, run
+from ofsat_ros.nodes.runtime import parser_of, prepare_for_large_images, run
+from ofsat_ros.nodes.topics import advertise, hear
 from ofsat_ros.pipeline import Pipeline
 from ofsat_ros.recordings import IMAGE, Topic
 
@@ -112,7 +114,7 @@ def film(folder: Path, sky: Sky, topics: Sequence[str], rate_hz: float, stop: Ev
     prepare_for_large_images()
     rclpy.init()
     node = rclpy.create_node("camera")
-    publishers = [node.create_publisher(Image, topic, reliable(5)) for topic in topics]
+    publishers = [advertise(node, Image, topic, 5) for topic in topics]
     frames, number, due_s = Frames(folder, sky), 0, time.monotonic()
     while not stop.is_set():
         for publisher in publishers:
@@ -177,7 +179,7 @@ class Listener:
         def on_message(data: bytes) -> None:
             rows.append((time.time(), data))
 
-        self._node.create_subscription(kind, topic, on_message, reliable(1000), raw=True)
+        hear(self._node, kind, topic, on_message, 1000, raw=True)
 
     def __enter__(self) -> Listener:
         return self

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Make the SROS 2 policy: exactly the topics and services that each node has.
 
 ``python docs/policy.py`` starts every node, each alone, asks it what it has, and rewrites
@@ -68,7 +69,10 @@ def rights_of_all() -> dict[str, Rights]:
                 ],
             ),
             "guide": (lambda stop, context: GuideNode(context), [_SIM_TIME]),
-            "tdm_writer": (TdmWriter, [("-p", f"output:={folder}/tracks", *_SIM_TIME)]),
+            "tdm_writer": (
+                lambda stop, context: TdmWriter(context),
+                [("-p", f"output:={folder}/tracks", *_SIM_TIME)],
+            ),
             "recorder": (Recorder, [("-p", f"output:={folder}/results", *_SIM_TIME)]),
             "watch": (lambda stop, context: Watch(stop, io.StringIO(), context), [_SIM_TIME]),
             "player": (lambda stop, context: Player(stop, bag, context), [here]),

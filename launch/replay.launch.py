@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Play a bag to a detector, losing no frame, and stop when the bag ends.
 
 For example::

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """A ROS graph for one test: a context, the nodes under test, and a probe that talks to them."""
 
 import os

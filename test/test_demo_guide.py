@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The guide's demo from start to end: all nodes as processes, over DDS, in real time."""
 
 import csv
@@ -6,9 +7,12 @@ import signal
 from pathlib import Path
 
 import numpy as np
+import pytest
 from ros_graph import Process
 
 from ofsat_ros.nodes.demo_guide import COLUMNS
+
+pytestmark = pytest.mark.alone
 
 
 def test_rso_is_acquired_and_held(tmp_path):

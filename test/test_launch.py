@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The launch files start executables that exist, with parameters that exist.
 
 The wheels of ROS lack `launch`, so the files run with stand-ins that record what they ask for.

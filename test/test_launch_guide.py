@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The guide's launch file starts an executable that exists, with parameters that exist."""
 
 from typing import Any

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The detector over real DDS: one answer per image, and the answers say the same thing."""
 
 import threading

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The guide node over real DDS: what it tells a mount, and what it says of itself."""
 
 import math

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The player over real DDS: what the bag holds arrives whole, in order, when it should."""
 
 import re

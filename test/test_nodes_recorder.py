@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The recorder and the demo: the files say what was published."""
 
 import csv
@@ -8,6 +9,8 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import cv2
@@ -335,6 +338,32 @@ def test_ctrl_c_while_a_process_starts_leaves_none_behind(monkeypatch):
         start("player")
     (process,) = started
     assert process.returncode is not None
+
+
+def test_demo_whose_recorder_gives_up_says_so_once(tmp_path, monkeypatch, capsys):
+    full = f"print('{HEARING}', flush=True); raise SystemExit(1)"  # it has said that the disk is
+    stand_ins = {"recorder": full, "detector": "import sys; sys.stdin.read()", "player": ""}
+
+    @contextmanager
+    def children() -> Iterator[Callable[..., subprocess.Popen]]:
+        with ExitStack() as running:
+
+            def start(node: str, *_: str, piped: bool = False) -> subprocess.Popen:
+                command = [sys.executable, "-S", "-c", stand_ins[node]]
+                pipe = subprocess.PIPE
+                process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True)
+                return running.enter_context(process)
+
+            yield start
+
+    monkeypatch.setattr(demo, "children", children)
+    monkeypatch.setattr(demo, "stop_on_signals", lambda: None)
+    bag, output = write_bag(tmp_path / "bag", sky(2)), tmp_path / "output"
+    monkeypatch.setattr("sys.argv", ["demo", "--bag", f"{bag}", "--output", f"{output}"])
+    assert demo.main() == 1
+    said = capsys.readouterr()
+    assert said.err == f"demo: the recorder has given up; {output} is not whole\n"
+    assert "played" not in said.out
 
 
 def test_demo_without_a_bag_says_so(tmp_path):

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """How nodes start and end: signals, start errors, and the hand-over to their own threads."""
 
 import importlib
@@ -140,7 +141,7 @@ def test_signals_end_every_node_within_a_second(number, tmp_path):
         nodes["simulator"].wait_for("px every")
         nodes["player"].wait_for("waiting for 1 subscriber")
         nodes["recorder"].wait_for("hearing a detector")
-        nodes["recorder"].wait_for("no RSO")
+        nodes["recorder"].wait_for("time (UTC)")
         nodes["guide"].wait_for("waiting for tracks on")
         nodes["tdm_writer"].wait_for("writing the tracks of")
         # Other processes on this machine make and remove segments meanwhile.

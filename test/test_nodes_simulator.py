@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The simulator node over real DDS: its topics agree with each other, and it obeys commands."""
 
 import threading

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The detector's directions: calibration and attitude in over DDS, x y z, ra and dec out."""
 
 import itertools

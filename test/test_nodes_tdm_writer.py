@@ -1,10 +1,10 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The tdm_writer node: files of the tracks that were heard of, whatever happens meanwhile."""
 
 import math
 import os
 import re
 import signal
-import threading
 import time
 from pathlib import Path
 
@@ -58,7 +58,7 @@ class Writer:
 
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
-        self.node = graph.add(TdmWriter(threading.Event(), context=graph.context))
+        self.node = graph.add(TdmWriter(context=graph.context))
         self._clouds = graph.publisher(PointCloud2, "rso_detections")
         graph.connect(self._clouds)
         self._sent = 0
@@ -233,7 +233,7 @@ def test_tracks_end_when_no_more_images_come(writer, tmp_path, monkeypatch, inte
 def test_what_is_open_after_a_night_is_written_at_once(tmp_path, name):
     # Half a second is what a node has to close; the worst is when every file is full.
     with Graph("-p", f"output:={tmp_path / 'out'}", "-p", f"format:={name}") as graph:
-        node = graph.add(TdmWriter(threading.Event(), context=graph.context))
+        node = graph.add(TdmWriter(context=graph.context))
         longest = TdmWriterParameters().longest_directions
         rows = messages.detections_array(cloud(0, 1, 2, 3, 4, 5))
         rows["sigma_ra"] = rows["sigma_dec"] = 1e-6
@@ -322,14 +322,14 @@ def test_it_does_not_start_with(tmp_path, given, error, words, monkeypatch):
         Graph("-p", given) as graph,
         pytest.raises(error, match=words.replace("|", r"\|")),
     ):
-        TdmWriter(threading.Event(), context=graph.context)
+        TdmWriter(context=graph.context)
     assert not list(tmp_path.iterdir())
 
 
 def test_without_a_name_the_folder_is_named_by_the_time(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with Graph() as graph:
-        graph.add(TdmWriter(threading.Event(), context=graph.context))
+        graph.add(TdmWriter(context=graph.context))
     (folder,) = tmp_path.iterdir()
     assert re.fullmatch(r"tracks_\d{8}_\d{6}", folder.name)
 

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The watch: what it shows on a terminal, and that it leaves it as it was."""
 
 import fcntl
@@ -16,12 +17,11 @@ from collections.abc import Iterator
 import click
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command import invoke
 from diagnostic_msgs.msg import DiagnosticArray
 from ros_graph import PATIENCE_S, Graph, header, image, sky
 from sensor_msgs.msg import Image, PointCloud2, PointField
 
-from ofsat_ros.cli import main
 from ofsat_ros.detection import CONFIRMED
 from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.board import Board
@@ -145,6 +145,16 @@ def test_a_low_terminal_shows_the_first_tracks_and_says_that_there_are_more(cloc
         shown(one, height=height)
 
 
+@pytest.mark.parametrize("width", [1, 8, 14, 30])
+def test_a_narrow_terminal_shows_as_much_as_fits(width, clock):
+    one = board()
+    shown(one, width)
+    one.status("/detector: detection", True, "no image on /image for 9 s", VALUES)
+    one.tracks(STAMP_NS, rows(*({**ONE, "track_id": number} for number in range(1, 31))))
+    shown(one, width, 200)
+    shown(one, width, 12)
+
+
 def test_only_so_many_ended_tracks_are_kept(clock):
     one = board()
     for number in range(1, 300):
@@ -227,7 +237,7 @@ def test_without_a_detector_it_says_where_else_there_is_one(clock):
 
 def test_a_namespace_that_is_none_is_bad_usage():
     for name in ("a b", "1st", "/a//b", "east;"):
-        done = CliRunner().invoke(main, ["watch", "--namespace", name])
+        done = invoke("watch", "--namespace", name)
         assert done.exit_code == 2
         assert f"'{name}' is no namespace" in " ".join(done.stderr.split())
 
@@ -362,6 +372,6 @@ def test_without_a_terminal_it_says_what_else_there_is():
 
 def test_without_ros_the_command_says_what_to_do(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    done = CliRunner().invoke(main, ["watch"])
+    done = invoke("watch")
     assert done.exit_code == 1
-    assert "source /opt/ros/jazzy/setup.bash" in done.output
+    assert "source /opt/ros/jazzy/setup.bash" in done.stderr

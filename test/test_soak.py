@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The long night's benchmark tells growth, false tracks and lost frames from their absence."""
 
 import itertools
@@ -107,6 +108,7 @@ def test_own_segments_are_those_of_the_process():
     assert not any(Path("/dev/shm", name).exists() for name in names)
 
 
+@pytest.mark.alone
 def test_a_night_over_dds(folder: Path, tmp_path: Path):
     for name in ("images.npy", "truth.npz"):
         (tmp_path / name).symlink_to(folder / name)

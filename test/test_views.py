@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The RViz view and the Foxglove layout name what the nodes really publish, over DDS."""
 
 import json

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """A long night, in short: what a night of eight hours does to memory, lateness and results.
 
 ``python -m benchmarks.soak`` prints Markdown tables, row by row as they come, of: 50,000 frames of

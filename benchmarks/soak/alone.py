@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The night without ROS: `Pipeline` frame by frame, and ``ofsat process`` over one long bag."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The night over DDS: a camera, the nodes that stay up all night, and what disturbs them.
 
 Camera, detector, guide, tdm_writer, recorder and viewers are processes of their own, in a ROS
@@ -33,8 +34,9 @@ from std_msgs.msg import Header
 from benchmarks.soak.night import Night, camera_of
 from benchmarks.soak.watching import MB, Held, growth, own_segments, shared_bytes
 from ofsat_ros.nodes import messages
-from ofsat_ros.nodes.runtime import prepare_for_large_images, reliable
+from ofsat_ros.nodes.runtime import prepare_for_large_images
 from ofsat_ros.nodes.simulator import camera_info
+from ofsat_ros.nodes.topics import advertise, hear
 
 _NS = 1_000_000_000
 _PATIENCE_S = 60.0
@@ -102,9 +104,9 @@ def camera(folder: Path, rate_hz: float, begin_ns: int, sent: Any, stop: Event) 
     prepare_for_large_images()
     rclpy.init()
     node = rclpy.create_node("camera")
-    images = node.create_publisher(Image, "image", reliable(10))
-    infos = node.create_publisher(CameraInfo, "camera_info", reliable(10))
-    attitudes = node.create_publisher(QuaternionStamped, "attitude", reliable(10))
+    images = advertise(node, Image, "image", 10)
+    infos = advertise(node, CameraInfo, "camera_info", 10)
+    attitudes = advertise(node, QuaternionStamped, "attitude", 10)
     night, number = Night.load(folder), 0
     seen = camera_of(night)
     while not stop.is_set():
@@ -132,7 +134,7 @@ def view(topic: str, pause_s: float) -> None:
     prepare_for_large_images()
     rclpy.init()
     node = rclpy.create_node("viewer")
-    node.create_subscription(Image, topic, lambda _: time.sleep(pause_s), reliable(5))
+    hear(node, Image, topic, lambda _: time.sleep(pause_s), 5)
     rclpy.spin(node)
 
 
@@ -146,12 +148,8 @@ class Ears:
         self.again = 0
         self.values: dict[str, str] = {}
         self.messages: set[str] = set()
-        self._node.create_subscription(
-            PointCloud2, "rso_detections", self._on_answer, reliable(1000), raw=True
-        )
-        self._node.create_subscription(
-            DiagnosticArray, "/diagnostics", self._on_diagnostics, reliable(100)
-        )
+        hear(self._node, PointCloud2, "rso_detections", self._on_answer, 1000, raw=True)
+        hear(self._node, DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
         self._thread = threading.Thread(target=self._executor.spin, daemon=True)

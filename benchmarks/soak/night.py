@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The sky of a long night: some frames, rendered beforehand, that come round for ever.
 
 The simulator's camera stands still and its sky is rolled on by some px a frame, so that after the

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What a process holds, as the system tells: memory, open files, threads, shared memory."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What a watcher has heard of tracks and health, as lines of text for a terminal.
 
 ``watch`` tells it what comes, and shows its `Board.lines`.  It imports no ROS.
@@ -84,6 +85,8 @@ class Board:
 
     def status(self, name: str, warns: bool, message: str, values: Mapping[str, str]) -> None:
         """Take note of what a node says of itself in ``/diagnostics``."""
+        if name.rpartition(": ")[2] not in (_DETECTION, *_BESIDE):
+            return  # of others, who may be many and are not shown
         values = {printable(key): printable(value) for key, value in values.items()}
         self._statuses[printable(name)] = _Status(
             warns, printable(message), values, time.monotonic()
@@ -102,9 +105,8 @@ class Board:
     def _title(self, width: int) -> str:
         left = f" ofsat watch  {' '.join(self._publishers) or self._topic}"
         right = f"{datetime.now(UTC):%H:%M:%S} UTC "
-        return click.style(
-            f"{left:<{width - len(right)}.{width - len(right)}}{right}", reverse=True
-        )
+        room = max(width - len(right), 0)
+        return click.style(f"{left:<{room}.{room}}{right}"[:width], reverse=True)
 
     def _health(self, width: int) -> Iterator[str]:
         """What the detector says of itself, and then the nodes beside it."""
@@ -160,9 +162,10 @@ class Board:
             past = over or self._is_past()
             yield click.style(text, dim=past, fg=None if past else colour)
         if not current and not ended:
-            yield "no track so far"
+            yield "no track so far"[:width]
         elif more := max(len(current) - room, 0):
-            yield click.style(f"and {more} more, for which the terminal is too low", fg="yellow")
+            words = f"and {more} more, for which the terminal is too low"
+            yield click.style(words[:width], fg="yellow")
 
     def _is_past(self) -> bool:
         """Whether a frame should have come since the last."""

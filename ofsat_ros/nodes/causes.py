@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What is said in the log of a stream of messages: each cause once, not each message.
 
 A camera that sends nonsense does so thirty times a second, all night.  ``/diagnostics`` shows what

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The demo: a bag's player, a detector and a recorder, each a process of its own, over DDS.
 
 Starts recorder and detector, waits until one hears the other, plays the bag, and ends by itself
@@ -23,7 +24,8 @@ from ofsat_ros.nodes.start import STOPPED
 from ofsat_ros.recordings import COMPRESSED_IMAGE, Bag, RecordingError, open_recording
 from ofsat_ros.results import DETECTIONS, in_words
 
-_START_S = 30.0
+# Imports of three nodes at once take half a minute where the processor is busy.
+_START_S = 60.0
 # Without a new line from anybody for so long, a frame will not be answered any more.
 _SILENCE_S = 30.0
 
@@ -85,6 +87,9 @@ def _run(options: argparse.Namespace) -> int:
             "player", "-p", f"bag:={bag}", "-p", f"topic:={topic}", "-p", f"rate:={options.rate}"
         )
         lines.wait_for_end(player, detector)
+        if recorder.poll():
+            sys.stderr.write(f"demo: the recorder has given up; {options.output} is not whole\n")
+            return 1
     return _sum_up(Path(options.output), count)
 
 
@@ -139,9 +144,10 @@ class _Echo:
         """Wait for a line; raise if a process ends before."""
         deadline_s = time.monotonic() + _START_S
         while wanted not in self._lines:
-            ended = [p for p in (self._recorder, *others) if p.poll() is not None]
-            if ended or time.monotonic() > deadline_s:
+            if any(process.poll() is not None for process in (self._recorder, *others)):
                 raise DemoError("the nodes did not start; see above")
+            if time.monotonic() > deadline_s:
+                raise DemoError(f"the nodes do not hear each other after {_START_S:g} s")
             time.sleep(0.05)
 
     def wait_for_end(self, player: subprocess.Popen, detector: subprocess.Popen) -> None:

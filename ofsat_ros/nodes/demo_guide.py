@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The guide's demo: simulated camera and mount, detector and guide, each a process, over DDS.
 
 Starts detector and guide (engaged), waits until they are there, starts the simulator with an RSO
@@ -31,8 +32,9 @@ from sensor_msgs.msg import CameraInfo, PointCloud2
 from ofsat_ros.camera import Camera
 from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.processes import children, own_graph, stop_on_signals
-from ofsat_ros.nodes.runtime import prepare_for_large_images, reliable
+from ofsat_ros.nodes.runtime import prepare_for_large_images
 from ofsat_ros.nodes.start import STOPPED
+from ofsat_ros.nodes.topics import hear
 
 SCENARIOS = ("guide_drift", "guide_leo")
 COLUMNS = ("stamp_ns", "time_s", "right_px", "down_px", "told_right_px", "told_down_px", "state")
@@ -126,7 +128,7 @@ class _LookerOn(Node):
             (Vector3Stamped, "target_offset", self._on_offset),
             (DiagnosticArray, "/diagnostics", self._on_diagnostics),
         ):
-            self.create_subscription(kind, topic, take, reliable(_DEPTH))
+            hear(self, kind, topic, take, _DEPTH)
 
     def _on_camera_info(self, info: CameraInfo) -> None:
         if self.heard.camera is None:

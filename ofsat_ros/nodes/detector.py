@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The detector node: images in, RSOs and their tracks out; a shell around ``pipeline.Pipeline``.
 
 Its callbacks only take messages in; one worker thread processes and publishes, so that every
@@ -15,9 +16,7 @@ import traceback
 import numpy as np
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.context import Context
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
 from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
@@ -31,15 +30,9 @@ from ofsat_ros.nodes.diagnostics import Diagnostics, Heartbeat
 from ofsat_ros.nodes.drawing import Drawing
 from ofsat_ros.nodes.health import Around, Health, stuck_words, timed
 from ofsat_ros.nodes.ros_parameters import NodeParameters, start_value
-from ofsat_ros.nodes.runtime import (
-    Inbox,
-    overridable_qos,
-    parser_of,
-    profile_path,
-    reliable,
-    run,
-)
+from ofsat_ros.nodes.runtime import Inbox, parser_of, profile_path, run
 from ofsat_ros.nodes.sky import Sky
+from ofsat_ros.nodes.topics import advertise, hear
 from ofsat_ros.parameters import (
     DEFAULT_PRESET,
     CameraParameters,
@@ -113,30 +106,23 @@ class Detector(Node):
         self._worker.join(0.5)
 
     def _create_publishers(self) -> None:
-        def publisher(kind: type, topic: str, depth: int):
-            qos = reliable(depth)
-            return self.create_publisher(
-                kind, topic, qos, qos_overriding_options=overridable_qos()
-            )
-
-        self._detections = publisher(PointCloud2, "rso_detections", _RESULTS_DEPTH)
-        self._tracks = publisher(PointCloud2, "rso_tracks", _RESULTS_DEPTH)
-        self._markers = publisher(MarkerArray, "flow_markers", _RESULTS_DEPTH)
-        self._motion = publisher(Vector3Stamped, "star_field_motion", _RESULTS_DEPTH)
-        self._annotated = publisher(Image, "image_annotated", _PICTURES_DEPTH)
+        self._detections = advertise(self, PointCloud2, "rso_detections", _RESULTS_DEPTH)
+        self._tracks = advertise(self, PointCloud2, "rso_tracks", _RESULTS_DEPTH)
+        self._markers = advertise(self, MarkerArray, "flow_markers", _RESULTS_DEPTH)
+        self._motion = advertise(self, Vector3Stamped, "star_field_motion", _RESULTS_DEPTH)
+        self._annotated = advertise(self, Image, "image_annotated", _PICTURES_DEPTH)
         self._diagnostics = Diagnostics(self, "detection")
 
     def _subscribe(self, own: DetectorParameters):
         compressed = own.image_transport == "compressed"
-        kind = ReliabilityPolicy.RELIABLE if own.reliable_input else ReliabilityPolicy.BEST_EFFORT
-        qos = QoSProfile(depth=own.queue_depth, reliability=kind)
-        return self.create_subscription(
+        return hear(
+            self,
             CompressedImage if compressed else Image,
             "image/compressed" if compressed else "image",
             self._on_image,
-            qos,
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible),
-            qos_overriding_options=overridable_qos(),
+            own.queue_depth,
+            reliable=own.reliable_input,
+            explain=lambda policy: self._health.incompatible_qos(policy),
         )
 
     def _on_change(self, table: Table) -> None:
@@ -165,10 +151,6 @@ class Detector(Node):
         """
         before, self._callbacks_s = self._callbacks_s, time.thread_time()
         return 0.0 if before is None else self._callbacks_s - before
-
-    def _on_incompatible(self, event) -> None:
-        policy = qos_policy_name_from_kind(event.last_policy_kind)
-        self.get_logger().warning(self._health.incompatible_qos(policy))
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._reset_wanted = "reset asked for"

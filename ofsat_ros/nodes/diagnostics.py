@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """How a node says how it is: its line on ``/diagnostics``, as aggregators and monitors expect it.
 
 Once a second, whether anything comes or not.  OK: all is well.  WARN: it works, but something is
@@ -14,9 +15,8 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
 
-from ofsat_ros.nodes.runtime import overridable_qos
+from ofsat_ros.nodes.topics import advertise
 
 _DEPTH = 100
 _HARDWARE_ID = "ofsat_ros"
@@ -37,12 +37,7 @@ class Diagnostics:
     def __init__(self, node: Node, about: str) -> None:
         self._node = node
         self._name = f"{node.get_fully_qualified_name()}: {about}"
-        self._publisher = node.create_publisher(
-            DiagnosticArray,
-            "/diagnostics",
-            QoSProfile(depth=_DEPTH),
-            qos_overriding_options=overridable_qos(),
-        )
+        self._publisher = advertise(node, DiagnosticArray, "/diagnostics", _DEPTH)
 
     def heard(self) -> bool:
         """Return whether anybody listens."""

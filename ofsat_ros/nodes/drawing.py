@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What the detector draws for people: ``flow_markers`` and ``image_annotated``.
 
 It stands after the answer, in a thread of its own: nothing is drawn that nobody looks at, and
@@ -14,7 +15,6 @@ import time
 import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
 
 import numpy as np
 from rclpy.duration import Duration
@@ -27,6 +27,7 @@ from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.health import Health
 from ofsat_ros.nodes.runtime import Inbox
 from ofsat_ros.pipeline import FrameResult
+from ofsat_ros.report.words import instant
 
 # s; the longest rest between two pictures.
 _REST_S = 0.2
@@ -135,7 +136,7 @@ class Drawing:
                 scene.result,
                 scale=scene.scale,
                 tails=scene.tails,
-                footer=f"{_utc(header)}  {self._health.pace()}",
+                footer=f"{instant(messages.stamp_ns(header.stamp))} UTC  {self._health.pace()}",
             )
             self._pictures.publish(messages.image_message(header, picture))
 
@@ -158,9 +159,3 @@ class Drawing:
             time.sleep(_POLL_S)
         self._received_s = time.monotonic()
         return True
-
-
-def _utc(header: Header) -> str:
-    """The time of an image, to be read by people."""
-    when = datetime.fromtimestamp(messages.stamp_ns(header.stamp) / 1e9, UTC)
-    return f"{when:%Y-%m-%d %H:%M:%S}.{when.microsecond // 100_000} UTC"

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The guide node: the detector's tracks in, commands for a mount out; a shell around ``guidance``.
 
 While it is engaged, ``mount_rate`` comes at `command_hz`; after that, until the rate has come to
@@ -26,14 +27,8 @@ from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.causes import Causes, say_left_out
 from ofsat_ros.nodes.diagnostics import Diagnostics, nobody_publishes
 from ofsat_ros.nodes.ros_parameters import NodeParameters
-from ofsat_ros.nodes.runtime import (
-    hear_camera_info,
-    overridable_qos,
-    parser_of,
-    qos_explained,
-    reliable,
-    run,
-)
+from ofsat_ros.nodes.runtime import parser_of, run
+from ofsat_ros.nodes.topics import advertise, hear, hear_camera_info
 from ofsat_ros.parameters import CameraParameters, GuideParameters, Table
 
 # A frame's tracks that come late are of use only if nothing newer has come.
@@ -81,8 +76,12 @@ class GuideNode(Node):
         # Commands and close() come from two threads.
         self._lock = threading.Lock()
         self._closed = False
-        self._create_publishers()
-        self._subscribe()
+        self._offset = advertise(self, Vector3Stamped, "target_offset", _DEPTH)
+        self._rate = advertise(self, Vector3Stamped, "target_rate", _DEPTH)
+        self._mount_rate = advertise(self, TwistStamped, "mount_rate", _DEPTH)
+        self._diagnostics = Diagnostics(self, "guidance")
+        hear_camera_info(self, self._on_camera_info)
+        self._tracks = hear(self, PointCloud2, "rso_tracks", self._on_tracks, _DEPTH)
         self.create_service(SetBool, "~/engage", self._on_engage)
         # A timer of the node's own clock would be silent for as long as that was set back.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -99,28 +98,6 @@ class GuideNode(Node):
             self._closed = True
             if self._command is not None and self._command.commanding:
                 self._publish_rate(self._header(), np.zeros(3))
-
-    def _create_publishers(self) -> None:
-        def publisher(kind: type, topic: str):
-            return self.create_publisher(
-                kind, topic, reliable(_DEPTH), qos_overriding_options=overridable_qos()
-            )
-
-        self._offset = publisher(Vector3Stamped, "target_offset")
-        self._rate = publisher(Vector3Stamped, "target_rate")
-        self._mount_rate = publisher(TwistStamped, "mount_rate")
-        self._diagnostics = Diagnostics(self, "guidance")
-
-    def _subscribe(self) -> None:
-        hear_camera_info(self, self._on_camera_info)
-        self._tracks = self.create_subscription(
-            PointCloud2,
-            "rso_tracks",
-            self._on_tracks,
-            reliable(_DEPTH),
-            event_callbacks=qos_explained(self, "rso_tracks"),
-            qos_overriding_options=overridable_qos(),
-        )
 
     def _on_change(self, table: Table) -> None:
         if isinstance(table, GuideParameters):

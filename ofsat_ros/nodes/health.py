@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What the detector knows of its own state: counts, rates, and what is wrong in words.
 
 The detector tells it what happens; ``/diagnostics`` shows what it makes of it.  It imports no ROS.

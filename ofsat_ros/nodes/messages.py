@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """ROS messages from and to the package's arrays: conversion, and nothing else.
 
 It stands between the nodes and everything that runs without ROS.  What results hold is said in

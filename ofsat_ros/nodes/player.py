@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The player node: a bag's images over DDS, as a camera would send them, none lost.
 
 The recorded bytes go out as they are, on the recorded topics, with the recording's time on
@@ -25,14 +26,8 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.ros_parameters import NodeParameters
-from ofsat_ros.nodes.runtime import (
-    StartError,
-    lifetime,
-    overridable_qos,
-    parser_of,
-    reliable,
-    run,
-)
+from ofsat_ros.nodes.runtime import StartError, lifetime, parser_of, run
+from ofsat_ros.nodes.topics import advertise, hear
 from ofsat_ros.parameters import PlayerParameters
 from ofsat_ros.printing import printable
 from ofsat_ros.recordings import (
@@ -108,15 +103,11 @@ class Player(Node):
             for name, about in self._bag.topics.items()
             if about.msgtype in _TYPES_BESIDE
         }
-        self._clock_publisher = (
-            self.create_publisher(Clock, "/clock", reliable(_DEPTH)) if own.clock else None
-        )
+        self._clock_publisher = advertise(self, Clock, "/clock", _DEPTH) if own.clock else None
         self._clock_at_s = 0.0
         self._unanswered: deque[int] = deque()
         self._answered = threading.Condition()
-        self._answers = self.create_subscription(
-            PointCloud2, "rso_detections", self._on_answer, reliable(100)
-        )
+        self._answers = hear(self, PointCloud2, "rso_detections", self._on_answer, 100)
         self._nobody_answers = False
         self._answered_s = -math.inf
         self._truncated = 0
@@ -132,9 +123,7 @@ class Player(Node):
 
     def _publisher(self, name: str, depth: int = _DEPTH) -> Publisher:
         kind = (_TYPES | _TYPES_BESIDE)[self._bag.topics[name].msgtype]
-        return self.create_publisher(
-            kind, name, reliable(depth), qos_overriding_options=overridable_qos()
-        )
+        return advertise(self, kind, name, depth)
 
     def _on_answer(self, cloud: PointCloud2) -> None:
         stamp = messages.stamp_ns(cloud.header.stamp)

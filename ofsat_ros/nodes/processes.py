@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Nodes as processes of their own: what the demos start and, whatever happens, end."""
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import resources
 
-from ofsat_ros.nodes.start import END_SIGNALS
+from ofsat_ros.nodes.start import END_SIGNALS, on_end_signals
 
 _START = (sys.executable, "-m", "ofsat_ros.nodes.start")
 _PROFILE = resources.files("ofsat_ros").joinpath("data/fastdds_this_machine.xml")
@@ -24,7 +25,7 @@ def own_graph() -> Mapping[str, str]:
 
     Whatever the user's environment says: a mount that listens there must not obey a demo.
     """
-    domain = 1 + os.getpid() % 100
+    domain = 51 + os.getpid() % 50
     if os.environ.get("ROS_DOMAIN_ID") == f"{domain}":
         domain += 1
     return {
@@ -36,10 +37,8 @@ def own_graph() -> Mapping[str, str]:
 
 
 def stop_on_signals() -> None:
-    """Have signals raise KeyboardInterrupt; but who was told to outlive his terminal does so."""
-    for number in END_SIGNALS:
-        if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN:
-            signal.signal(number, signal.default_int_handler)
+    """Have the signals that end a process raise KeyboardInterrupt."""
+    on_end_signals(signal.default_int_handler)
 
 
 @contextmanager

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The recorder node: what a detector finds, as a table on the screen and as files.
 
 Writes into a folder: ``detections.csv``, ``frame_*.png`` (every n-th annotated image), and
@@ -30,17 +31,11 @@ from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.causes import Causes, say_left_out
 from ofsat_ros.nodes.diagnostics import Diagnostics, nobody_publishes
 from ofsat_ros.nodes.ros_parameters import NodeParameters
-from ofsat_ros.nodes.runtime import (
-    StartError,
-    overridable_qos,
-    parser_of,
-    qos_explained,
-    reliable,
-    run,
-    say,
-)
+from ofsat_ros.nodes.runtime import StartError, parser_of, run, say
+from ofsat_ros.nodes.topics import hear
 from ofsat_ros.parameters import RecorderParameters
 from ofsat_ros.recordings import BagWriter, RecordingError
+from ofsat_ros.report.words import instant
 from ofsat_ros.results import DETECTION_COLUMNS, DETECTIONS, detection_lines, in_words
 from ofsat_ros.results.bag import BAG
 
@@ -137,16 +132,10 @@ class Recorder(Node):
             kind: type, topic: str, take: Callable[..., None], depth: int = _DEPTH
         ) -> str:
             # Raw: the bag is to hold what was received, and few pictures are looked into.
-            subscription = self.create_subscription(
-                kind,
-                topic,
-                lambda data, info: self._take(topic, take, data, info),
-                reliable(depth),
-                raw=True,
-                event_callbacks=qos_explained(self, topic),
-                qos_overriding_options=overridable_qos(),
-            )
-            return subscription.topic_name
+            def on_message(data: bytes, info: dict) -> None:
+                self._take(topic, take, data, info)
+
+            return hear(self, kind, topic, on_message, depth, raw=True).topic_name
 
         self._cloud_topic = subscribe(PointCloud2, "rso_detections", self._on_detections)
         self._tracks_topic = subscribe(PointCloud2, "rso_tracks", self._on_tracks)
@@ -314,7 +303,7 @@ class _Table:
                 self.end()
             return
         self.end()
-        when = datetime.fromtimestamp(stamp / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S.%f")[:-3]
+        when = instant(stamp)
         for row in rows:
             speed = math.hypot(row["vx"], row["vy"])
             relative = math.hypot(row["rel_vx"], row["rel_vy"])

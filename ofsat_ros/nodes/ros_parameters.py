@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """ROS parameters from the package's one table: declared, described, checked, changed live.
 
 Stands between ``parameters`` (what exists and what is allowed) and a node's parameter services.

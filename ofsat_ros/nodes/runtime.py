@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What all nodes share: how a process becomes a node, and how it ends.
 
 `run` is the whole of a node's ``main``: it readies allocator and middleware for large images,
@@ -13,7 +14,6 @@ import argparse
 import ctypes
 import os
 import platform
-import signal
 import sys
 import threading
 import time
@@ -25,19 +25,15 @@ from importlib import resources
 from typing import Any, NoReturn, TextIO
 
 import rclpy
-from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
-from rclpy.qos_overriding_options import QoSOverridingOptions, QoSPolicyKind
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
-from sensor_msgs.msg import CameraInfo
 
 from ofsat_ros.nodes import shared_memory
 from ofsat_ros.nodes.ros_parameters import refuse_unknown
-from ofsat_ros.nodes.start import END_SIGNALS
+from ofsat_ros.nodes.start import on_end_signals
 from ofsat_ros.parameters import ParameterError
 from ofsat_ros.printing import printable
 
@@ -134,17 +130,6 @@ class Inbox:
 
     def _has_room(self, size: int) -> bool:
         return len(self._items) < self._depth or self._bytes + size <= self._limit_bytes
-
-
-def overridable_qos() -> QoSOverridingOptions:
-    """Let parameters ``qos_overrides.<topic>.<publisher|subscription>.*`` change a QoS."""
-    kinds = QoSPolicyKind
-    return QoSOverridingOptions((kinds.HISTORY, kinds.DEPTH, kinds.RELIABILITY, kinds.DURABILITY))
-
-
-def reliable(depth: int) -> QoSProfile:
-    """QoS of a publisher or subscription that loses nothing; each needs its own."""
-    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE)
 
 
 @contextmanager
@@ -244,30 +229,6 @@ def say(line: str, where: TextIO | None = None) -> None:
             os.dup2(nowhere.fileno(), where.fileno())
 
 
-def qos_explained(node: Node, topic: str) -> SubscriptionEventCallbacks:
-    """Return what has a subscription say why a publisher cannot be heard, and what to do."""
-    name = node.resolve_topic_name(topic)
-
-    def explain(event: QoSRequestedIncompatibleQoSInfo) -> None:
-        policy = qos_policy_name_from_kind(event.last_policy_kind).lower()
-        node.get_logger().warning(
-            f"a publisher of {name} cannot be heard, since it offers another {policy}: set"
-            f" qos_overrides.{name}.subscription.{policy} of this node to what it offers"
-        )
-
-    return SubscriptionEventCallbacks(incompatible_qos=explain)
-
-
-def hear_camera_info(node: Node, take: Callable[[CameraInfo], None]) -> None:
-    """Subscribe to ``camera_info``, best effort: this hears every sender."""
-    # Not for one that is kept for those who come later: asking for it makes all other senders
-    # warn of a subscriber that they cannot serve.
-    qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-    node.create_subscription(
-        CameraInfo, "camera_info", take, qos, qos_overriding_options=overridable_qos()
-    )
-
-
 def prepare_for_large_images() -> str:
     """Ready allocator and middleware for images of megabytes; call before ``rclpy.init``.
 
@@ -295,12 +256,9 @@ def _end_on_signals(stop: threading.Event, made: threading.Event) -> None:
         if not made.wait(_PATIENCE_S):  # a large bag that is opened, say: nothing is written yet
             _leave(0)
 
-    # Ours instead of rclpy's or Python's: no exception then breaks into whatever runs.
-    for number in END_SIGNALS:
-        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
-            # Not at once: this may have interrupted the main thread while it holds the event's
-            # own lock.
-            signal.signal(number, lambda *_: _thread.start_new_thread(end, ()))
+    # Ours instead of rclpy's or Python's: no exception then breaks into whatever runs.  Not at
+    # once: this may have interrupted the main thread while it holds the event's own lock.
+    on_end_signals(lambda *_: _thread.start_new_thread(end, ()))
 
 
 def _leave(code: int) -> NoReturn:

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The memory through which Fast DDS hands images on: what the dead left in it, and its room.
 
 A process that is killed (-9, or for want of memory) leaves its segment behind, 134 MB that no

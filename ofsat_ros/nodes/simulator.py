@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The simulator node: a simulated telescope camera, with the truth of what it sees.
 
 Takes the place of a camera driver and, in the scenarios that have one, of a mount; ``simulation``
@@ -23,7 +24,6 @@ from geometry_msgs.msg import QuaternionStamped, TwistStamped
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import Header
 
@@ -31,7 +31,8 @@ from ofsat_ros.camera import Camera, to_radec
 from ofsat_ros.detection import CONFIRMED
 from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.ros_parameters import NodeParameters
-from ofsat_ros.nodes.runtime import lifetime, overridable_qos, parser_of, reliable, run
+from ofsat_ros.nodes.runtime import lifetime, parser_of, run
+from ofsat_ros.nodes.topics import advertise, hear
 from ofsat_ros.parameters import SimulatorParameters
 from ofsat_ros.simulation import SimulatedFrame, SimulatedMount, SphereSimulator, scenario
 
@@ -72,10 +73,10 @@ class Simulator(Node):
         self._own = own = self._settings[SimulatorParameters]
         start_ns = self.get_clock().now().nanoseconds or time.time_ns()
         self._sky = scenario(own.scenario, own.seed, start_stamp_ns=start_ns)
-        self._images = self._publisher(Image, "image")
-        self._camera_info = self._publisher(CameraInfo, "camera_info")
-        self._attitude = self._publisher(QuaternionStamped, "attitude")
-        self._truth = self._publisher(PointCloud2, "rso_truth")
+        self._images = advertise(self, Image, "image", _DEPTH)
+        self._camera_info = advertise(self, CameraInfo, "camera_info", _DEPTH)
+        self._attitude = advertise(self, QuaternionStamped, "attitude", _DEPTH)
+        self._truth = advertise(self, PointCloud2, "rso_truth", _DEPTH)
         self._begun_s = time.monotonic()
         self._behind_s, self._say_behind_s = 0.0, _LITTLE_BEHIND_S
         self._mount: SimulatedMount | None = None
@@ -91,23 +92,11 @@ class Simulator(Node):
         self._stop.set()
         self._thread.join(0.5)
 
-    def _publisher(self, kind: type, topic: str):
-        return self.create_publisher(
-            kind, topic, reliable(_DEPTH), qos_overriding_options=overridable_qos()
-        )
-
     def _listen_for_commands(self) -> None:
         # From the callback's thread to that which renders and has the mount for itself.
         self._commands: deque[tuple[float, list[float]]] = deque()
         # Takes what any publisher offers; of commands, the newest counts.
-        qos = QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self.create_subscription(
-            TwistStamped,
-            "mount_rate",
-            self._on_mount_rate,
-            qos,
-            qos_overriding_options=overridable_qos(),
-        )
+        hear(self, TwistStamped, "mount_rate", self._on_mount_rate, _DEPTH, reliable=False)
 
     def _on_mount_rate(self, message: TwistStamped) -> None:
         rate = message.twist.angular

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The detector's calibration and attitude: two topics in, the directions of what it finds out.
 
 Callbacks put in what comes, the detector's worker asks for directions: hence the lock.  How
@@ -11,14 +12,13 @@ import threading
 import numpy as np
 from geometry_msgs.msg import QuaternionStamped
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
 
 from ofsat_ros.camera import Astrometry, Camera, CameraError, rotation_of
 from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.causes import Causes
-from ofsat_ros.nodes.runtime import hear_camera_info, overridable_qos
+from ofsat_ros.nodes.topics import hear, hear_camera_info
 from ofsat_ros.parameters import CameraParameters
 from ofsat_ros.printing import printable
 
@@ -47,13 +47,8 @@ class Sky:
         self._has_attitude = self._was_calibrated = False
         self._bad_calibrations, self._bad_attitudes = Causes(), Causes()
         hear_camera_info(node, self._on_camera_info)
-        kind = ReliabilityPolicy.RELIABLE if reliable_input else ReliabilityPolicy.BEST_EFFORT
-        node.create_subscription(
-            QuaternionStamped,
-            "attitude",
-            self._on_attitude,
-            QoSProfile(depth=_DEPTH, reliability=kind),
-            qos_overriding_options=overridable_qos(),
+        hear(
+            node, QuaternionStamped, "attitude", self._on_attitude, _DEPTH, reliable=reliable_input
         )
 
     def look_around(self) -> None:

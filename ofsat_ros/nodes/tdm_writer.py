@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The tdm_writer node: each track's directions as a file, once the track has ended.
 
 Stands after the detector, beside whatever determines orbits, and writes what ``tracking_data``
@@ -30,15 +31,8 @@ from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.causes import Causes, say_left_out
 from ofsat_ros.nodes.diagnostics import Diagnostics, nobody_publishes
 from ofsat_ros.nodes.ros_parameters import NodeParameters
-from ofsat_ros.nodes.runtime import (
-    StartError,
-    overridable_qos,
-    parser_of,
-    qos_explained,
-    reliable,
-    run,
-    say,
-)
+from ofsat_ros.nodes.runtime import StartError, parser_of, run, say
+from ofsat_ros.nodes.topics import hear
 from ofsat_ros.parameters import (
     CameraParameters,
     Table,
@@ -66,8 +60,6 @@ class TdmWriter(Node):
 
     Parameters
     ----------
-    stop : threading.Event
-        Not used: the node works until it is stopped.
     context : Context, optional
         ROS context; default: the process's.
 
@@ -84,7 +76,7 @@ class TdmWriter(Node):
         If the output folder cannot be made or written.
     """
 
-    def __init__(self, stop: threading.Event, context: Context | None = None) -> None:
+    def __init__(self, context: Context | None = None) -> None:
         super().__init__("tdm_writer", context=context)
         self.exit_code = 0
         self._settings = NodeParameters(
@@ -115,14 +107,7 @@ class TdmWriter(Node):
         # No callback waits for a disk: heartbeat and detections go on while it hangs.
         self._thread = threading.Thread(target=self._write, name="tdm_writer", daemon=True)
         self._thread.start()
-        subscription = self.create_subscription(
-            PointCloud2,
-            "rso_detections",
-            self._on_detections,
-            reliable(_DEPTH),
-            event_callbacks=qos_explained(self, "rso_detections"),
-            qos_overriding_options=overridable_qos(),
-        )
+        subscription = hear(self, PointCloud2, "rso_detections", self._on_detections, _DEPTH)
         self._diagnostics = Diagnostics(self, "tracking data")
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0, self._publish_diagnostics, clock=steady)
@@ -293,6 +278,6 @@ def _in_words(tracks: int) -> str:
 def main() -> int:
     """Run the node; return the exit code."""
     return run(
-        lambda stop, options: TdmWriter(stop),
+        lambda stop, options: TdmWriter(),
         parser_of("tdm_writer", "Write the directions of tracks for orbit determination."),
     )

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The watch node: tracks and health of a running detector on a terminal, for people on ssh.
 
 It shows again and again what ``board`` makes of ``rso_tracks`` and ``/diagnostics``, until Ctrl-C;
@@ -15,12 +16,12 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
 from ofsat_ros.nodes import messages
 from ofsat_ros.nodes.board import Board
-from ofsat_ros.nodes.runtime import StartError, lifetime, overridable_qos, parser_of, run
+from ofsat_ros.nodes.runtime import StartError, lifetime, parser_of, run
+from ofsat_ros.nodes.topics import hear
 
 # s; of text on a slow line this is little, and an eye is not faster.
 _PERIOD_S = 0.5
@@ -55,12 +56,10 @@ class Watch(Node):
         self._stop, self._out = stop, out
         self._closed = threading.Event()
         # Best effort hears every sender, and a frame that is lost is not missed here.
-        qos = QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-        overridable = overridable_qos()
-        self._tracks = self.create_subscription(
-            PointCloud2, "rso_tracks", self._on_tracks, qos, qos_overriding_options=overridable
+        self._tracks = hear(
+            self, PointCloud2, "rso_tracks", self._on_tracks, _DEPTH, reliable=False
         )
-        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, qos)
+        hear(self, DiagnosticArray, "/diagnostics", self._on_diagnostics, _DEPTH, reliable=False)
         self._board = Board(self._tracks.topic_name)
         # Callbacks and the terminal's thread look at the same board.
         self._lock = threading.Lock()
