@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Bags for tests, written by this package and by the libraries of others."""
 
 import mcap.writer

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Messages into bags: those that need not be given whole, and those that Ctrl-C would cut.
 
 What is written of images, calibrations and attitudes is read back in test_recordings.py.

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The sample bags: the commands in their README still make what is in them."""
 
 import re
@@ -6,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command import invoke
 
-from ofsat_ros.cli import main
 from ofsat_ros.recordings import open_recording
 from ofsat_ros.simulation import TRUTH_DTYPE
 
@@ -54,7 +54,7 @@ def test_every_bag_has_its_command_its_truth_and_its_row():
 def test_the_command_still_makes_the_same_content(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "bags").mkdir()
-    done = CliRunner().invoke(main, shlex.split(COMMANDS[name])[1:])
+    done = invoke(*shlex.split(COMMANDS[name])[1:])
     assert done.exit_code == 0, done.output
     kept, made = frames_of(BAGS / name), frames_of(tmp_path / "bags" / name)
     assert len(kept) == len(made) > 0

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The files that ``ofsat process`` makes: tables, bag, run, report, video; and what stays."""
 
 import csv
@@ -11,12 +12,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
-from command import fails, ofsat
+from click.testing import Result
+from command import fails, invoke, ofsat
 from scipy.spatial.transform import Rotation
 
 from ofsat_ros.camera import Camera
-from ofsat_ros.cli import main
 from ofsat_ros.parameters import CameraParameters, Parameters, TrackingDataParameters
 from ofsat_ros.recordings import Bag, BagWriter, open_recording
 from ofsat_ros.results import read_run
@@ -175,7 +175,7 @@ def test_a_full_disk_is_told_in_words_and_a_video_needs_no_report(bag, tmp_path,
     monkeypatch.setattr("ofsat_ros.cli.process.write_video", write_video)
     film = tmp_path / "film.mp4"
     words = ("process", bag, "-o", tmp_path / "out", "--video", film)
-    done = CliRunner().invoke(main, [str(word) for word in words])
+    done = invoke(*words)
     assert done.exit_code == 0
     assert done.stderr == "note: no report is written: No space left on device\n"
     assert film.exists()
@@ -191,7 +191,7 @@ def test_a_report_that_cannot_be_made_costs_nothing_but_itself(error, bag, tmp_p
     said = "the extra ofsat_ros[report] is missing"
     command = ("process", bag, "-o", tmp_path)
     # As nobody has said a word of it; the tests' own default is none.
-    done = CliRunner().invoke(main, [str(word) for word in command])
+    done = invoke(*command)
     assert (done.exit_code, done.stderr) == (0, f"note: no report is written: {said}\n")
     assert fails(1, *command, "--force", "--report") == f"ofsat: {said}"
     assert "report.html" not in read_run(tmp_path)["files"]

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Directions and times of ``ofsat process``: calibration and attitude from the recording."""
 
 import csv

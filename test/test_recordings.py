@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Bags in and out: every storage and compression; test_bag_salvage.py has those that are torn."""
 
 import threading

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """FITS in: files of astropy's, their pixels, times and order, and how they can be bad."""
 
 import contextlib

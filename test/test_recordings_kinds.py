@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Which kind of recording is at a path, what is left out of it, and what is said of it."""
 
 import shutil

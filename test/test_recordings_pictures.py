@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Folders of pictures in, and which kind of recording a path is."""
 
 import sys
@@ -69,7 +70,7 @@ def photo(path, number, time=None, **tags):
     """Write a JPEG as a camera does, with EXIF."""
     names = {"fraction": 0x9291, "zone": 0x9011, "exposure": 0x829A}
     exif = Image.Exif()
-    about = exif.get_ifd(0x8769)
+    exif[0x8769] = about = {}
     if time:
         about[0x9003] = time
     for name, value in tags.items():

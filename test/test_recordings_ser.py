@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """SER in: files as the description of the format has them, byte by byte."""
 
 import struct

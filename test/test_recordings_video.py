@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Video in: files of OpenCV's, lossless and not, whole and cut."""
 
 import cv2

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """World coordinates of FITS as camera and attitude, against astropy.wcs."""
 
 import numpy as np

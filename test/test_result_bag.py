@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """A bag of results holds what the detector publishes, made without ROS."""
 
 import subprocess

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Result files: their columns, and that what is written is what was found."""
 
 import contextlib

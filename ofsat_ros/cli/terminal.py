@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What the commands share: words to the user, options, folders to write to."""
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from tqdm import tqdm
 
 from ofsat_ros.parameters import Description, Table
 from ofsat_ros.printing import printable
-from ofsat_ros.recordings import RecordingError, utc_ns, utc_text
+from ofsat_ros.recordings import RecordingError, utc_ns
 
 _Command = Callable[..., None]
 _ALL = f"{__name__}.all"
@@ -74,22 +75,19 @@ def _option_type(about: Description) -> Any:
     return click.Choice(about.choices) if about.choices else type(about.default)
 
 
-class _Instant(click.ParamType):
+class Instant(click.ParamType):
     """A date and a time, as ns UTC."""
 
     name = "utc"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Read it, or say what is wrong with it."""
         if isinstance(value, int):
             return value
         try:
             return utc_ns(value)
         except ValueError as error:
             self.fail(f"{error}: give it as 2026-03-01T22:15:00Z", param, ctx)
-
-
-# The options of `open_recording` whose names are not those of its arguments.
-_NAMES = {"exposure_s": "--exposure", "start_ns": "--start"}
 
 
 def recording_argument(command: _Command) -> _Command:
@@ -100,17 +98,6 @@ def recording_argument(command: _Command) -> _Command:
     )
 
 
-def process_words(paths: tuple[Path, ...], options: dict[str, Any]) -> list[str]:
-    """Return the words of the command that processes recordings, with options by their names."""
-    words = ["ofsat", "process", *map(str, paths), "-o", "results"]
-    for name, value in options.items():
-        if value is not None:
-            if name == "start_ns":
-                value = utc_text(value)
-            words += [_NAMES.get(name, f"--{name.replace('_', '-')}"), f"{value}"]
-    return words
-
-
 def recording_options(command: _Command) -> _Command:
     """Add the options of `open_recording`, each by the name of its argument."""
     positive = click.FloatRange(min=0, min_open=True)
@@ -118,7 +105,7 @@ def recording_options(command: _Command) -> _Command:
         click.option(
             "--start",
             "start_ns",
-            type=_Instant(),
+            type=Instant(),
             metavar="UTC",
             help="when the first exposure began, where no frame has a time",
         ),
@@ -140,12 +127,6 @@ def recording_options(command: _Command) -> _Command:
     return command
 
 
-def of_table(table: type[Table], given: dict[str, Any]) -> dict[str, Any]:
-    """Return those of the given values that are a table's."""
-    names = {about.name for about in table.describe()}
-    return {name: value for name, value in given.items() if name in names}
-
-
 def spare_input(recordings: Sequence[Path], target: Path) -> None:
     """Refuse to write over what is read.
 
@@ -158,6 +139,18 @@ def spare_input(recordings: Sequence[Path], target: Path) -> None:
     for path in recordings:
         if resolved in (path.resolve(), *path.resolve().parents):
             raise RecordingError(f"{path} is read, so it cannot be the output: choose another one")
+
+
+def spare_existing(target: Path | None, force: bool) -> None:
+    """Refuse to replace a file that is there, without being told to.
+
+    Raises
+    ------
+    RecordingError
+        If there is one.
+    """
+    if target is not None and target.exists() and not force:
+        raise RecordingError(f"{target} exists: choose another name, or --force to replace it")
 
 
 def fail(error: Exception | str, left: str = "") -> NoReturn:

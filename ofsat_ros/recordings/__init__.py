@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Recordings: frames in from bags, FITS, SER, video and images, and bags out.
 
 It stands before the pipeline offline, as the camera does live: ``open_recording`` yields the
@@ -63,6 +64,8 @@ def open_recording(
     fps: float | None = None,
     exposure_s: float | None = None,
     start_ns: int | None = None,
+    first: int = 0,
+    end: int | None = None,
 ) -> Recording:
     """Open a recording to read its frames.
 
@@ -85,6 +88,9 @@ def open_recording(
         Length of the exposures, s, where the headers do not tell it.
     start_ns : int, optional
         When the first exposure began, ns UTC, where the files do not give each frame its time.
+    first, end : int, optional
+        Read only the frames of these numbers, the latter left out.  They keep their numbers and
+        their times, and what was recorded before them of calibration and attitude.
 
     Returns
     -------
@@ -105,7 +111,7 @@ def open_recording(
     try:
         files = [Path(each) for each in paths]
         source, notes = thread.submit(source_of, files, names, hints).result()
-        return Recording(source, notes, thread)
+        return Recording(source, notes, thread, first, end)
     except BaseException:
         thread.shutdown()
         raise

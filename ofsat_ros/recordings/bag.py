@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """A bag's messages as they were recorded, whatever its storage, and whatever became of it.
 
 Raw: ``recordings`` turns them into frames, the player publishes them as they are.

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The frames of one image topic of a bag, with the calibrations and attitudes beside it."""
 
 from __future__ import annotations
@@ -49,7 +50,9 @@ class BagSource:
         """See `Source`."""
         self._bag.close()
 
-    def frames(self, say: Callable[[str], None]) -> Iterator[Frame | Skipped]:
+    def frames(
+        self, say: Callable[[str], None], first: int = 0
+    ) -> Iterator[Frame | Skipped | None]:
         """See `Source`."""
         self._start_over()
         count = 0
@@ -58,7 +61,8 @@ class BagSource:
             if topic != self.topic:
                 self._take_beside(topic, msgtype, data, say)
                 continue
-            yield self._decode(count, msgtype, received_ns, data, say)
+            known = count < first
+            yield None if known else self._decode(count, msgtype, received_ns, data, say)
             count += 1
 
     @property

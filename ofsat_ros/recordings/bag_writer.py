@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Images and messages into a new rosbag2 folder."""
 
 from __future__ import annotations
@@ -119,7 +120,7 @@ class BagWriter:
                 self._writer: Writer | None = Writer(self.path, version=9, storage_plugin=plugin)
                 self._writer.set_compression(mode, CompressionFormat.ZSTD)
                 self._writer.open()
-        except (OSError, WriterError) as error:
+        except (OSError, sqlite3.Error, WriterError) as error:
             raise RecordingError(f"cannot write {self.path}: {_reason(error)}") from error
         except KeyboardInterrupt:
             self.close()

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Folders that belong to a process for as long as it lives.
 
 The system drops the lock of a process that ends, be it killed: what such a one has left behind is

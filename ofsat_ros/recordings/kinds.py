@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Which kind of recording there is at a path, and what reads it."""
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ def _find(path: Path) -> _Found:
                 f" {_ALL}, or a folder of FITS files or pictures; {_CONVERT}"
             )
         return _Found(path, kind, [path])
-    files = _sorted_out(sorted(path.iterdir()))
+    files = files_by_kind(sorted(path.iterdir()))
     if not files:
         raise RecordingError(_nothing_in(path))
     kind, *others = files
@@ -157,7 +158,7 @@ def _series(opened: Callable[[Path], TimedSource], files: list[Path]) -> Source:
         raise
 
 
-def _sorted_out(files: list[Path]) -> dict[str, list[Path]]:
+def files_by_kind(files: list[Path]) -> dict[str, list[Path]]:
     """Return a folder's files that can be read by their kinds, the first to be read first."""
     found: dict[str, list[Path]] = {kind: [] for kind in _SUFFIXES}
     for file in files:
@@ -197,7 +198,7 @@ def _below(folder: Path, wanted: str = "", deepest: int = _DEEPEST) -> dict[Path
         folders[:] = sorted(each for each in folders if not each.startswith("."))
         if len(here.parts) - depth >= deepest:
             folders.clear()
-        there = _sorted_out([here / file for file in files]) if number else {}
+        there = files_by_kind([here / file for file in files]) if number else {}
         if kind := next((kind for kind in there if wanted in ("", kind)), ""):
             found[here] = _counted(kind, there[kind])
             if kind == "bag":

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """ROS messages made without ROS, by rosbags: their classes, and their bytes."""
 
 from __future__ import annotations

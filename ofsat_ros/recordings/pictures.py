@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Folders of pictures: PNG, TIFF, JPEG and BMP."""
 
 from __future__ import annotations
@@ -66,9 +67,14 @@ class PictureSource:
     def close(self) -> None:
         """See `Source`."""
 
-    def frames(self, say: Callable[[str], None]) -> Iterator[Frame | Skipped]:
+    def frames(
+        self, say: Callable[[str], None], first: int = 0
+    ) -> Iterator[Frame | Skipped | None]:
         """See `Source`."""
         for number, shot in enumerate(self._shots):
+            if number < first:
+                yield None
+                continue
             name = f"frame {number} ({shot.name})"
             if shot.reason or shot.stamp_ns is None:
                 yield Skipped(name, shot.reason)

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Frames of any recording, read ahead in a thread: what stands before the pipeline offline.
 
 A `Source` knows one kind of file; `Recording` is what they all look like from outside.
@@ -120,13 +121,18 @@ class Source(Protocol):
     def last_attitudes(self) -> tuple[Attitude, ...]:
         """Attitudes recorded after the last frame; complete when `frames` has ended."""
 
-    def frames(self, say: Callable[[str], None]) -> Iterator[Frame | Skipped]:
-        """Yield every frame from the first on, or why one is skipped.
+    def frames(
+        self, say: Callable[[str], None], first: int = 0
+    ) -> Iterator[Frame | Skipped | None]:
+        """Yield every frame, or why one is skipped.
 
         Parameters
         ----------
         say : callable
             Takes what the user should know of this look at the recording.
+        first : int
+            Of frames before this one, None is yielded, and they are not decoded; the calibration
+            and the attitudes recorded among them come with the first frame that is.
 
         Raises
         ------
@@ -143,7 +149,8 @@ class Recording:
 
     Iterating yields every `Frame` in the order of the recording, each read and decoded ahead in a
     thread while the one before is in work.  A frame that cannot be decoded is left out, counted
-    and named; so is the rest of a recording that is damaged from some frame on.
+    and named; so is the rest of a recording that is damaged from some frame on.  Of a recording
+    that was opened from a frame on, or up to one, the others are not there.
 
     Attributes
     ----------
@@ -163,12 +170,23 @@ class Recording:
         Frames that the last iteration could not give.
     torn : str
         Why the last iteration ended before the recording's end; empty if it did not.
+    reached : int
+        Number after that of the last frame that the last iteration came to; where it came to the
+        recording's end, the count of all frames, also those of which only the index tells.
     seconds : float
         Time that the last iteration's reading and decoding took, in its own thread, s.
     """
 
-    def __init__(self, source: Source, notes: list[str], thread: ThreadPoolExecutor) -> None:
+    def __init__(
+        self,
+        source: Source,
+        notes: list[str],
+        thread: ThreadPoolExecutor,
+        first: int = 0,
+        end: int | None = None,
+    ) -> None:
         self._source, self._notes = source, notes
+        self._first, self._end = first, end
         # All that the source does is done in this one thread, which SQLite may ask for.
         self._thread: ThreadPoolExecutor | None = thread
         self._coming: deque[Future[Frame | None]] = deque()
@@ -195,7 +213,8 @@ class Recording:
 
     def __len__(self) -> int:
         """Return the count of frames that the recording's index tells of."""
-        return self._source.count
+        count = self._source.count
+        return max(0, (count if self._end is None else min(count, self._end)) - self._first)
 
     @property
     def problems(self) -> list[str]:
@@ -237,26 +256,31 @@ class Recording:
         self._start_over()
         count = 0
         try:
-            for given in self._source.frames(self._said.append):
+            for given in self._source.frames(self._said.append, self._first):
                 count += 1
+                self.reached = count
                 if isinstance(given, Frame):
                     yield given
-                else:
+                elif given is not None:
                     self._skip(given)
+                if count == self._end:
+                    return
         except RecordingError as error:
             if not count:
                 raise
             self.torn = f"{error}"
             self._said.append(self.torn)
-        if count < len(self):
-            self.skipped += len(self) - count
+        told = self._source.count
+        self.reached = max(count, told)
+        if count < told:
+            self.skipped += len(self) - max(0, count - self._first)
             on = f" on {self.topic}" if self.topic else ""
             self._said.append(
-                f"{self.path} tells of {len(self)} images{on}, but only {count} could be read"
+                f"{self.path} tells of {told} images{on}, but only {count} could be read"
             )
 
     def _start_over(self) -> None:
-        self.skipped = 0
+        self.skipped = self.reached = 0
         self.torn = ""
         self.seconds = 0.0
         self._said: list[str] = []

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """SER files: raw frames of planetary cameras, with a time for each.
 
 Layout: G. Hahn, H. Wilkens, "SER format description version 3" (2014): a header of 178 bytes, the
@@ -72,9 +73,14 @@ class SerSource:
         """See `Source`."""
         self._file.close()
 
-    def frames(self, say: Callable[[str], None]) -> Iterator[Frame | Skipped]:
+    def frames(
+        self, say: Callable[[str], None], first: int = 0
+    ) -> Iterator[Frame | Skipped | None]:
         """See `Source`."""
         for number in range(self._whole):
+            if number < first:
+                yield None
+                continue
             try:
                 image = self._image(number)
             except EncodingError as error:

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Several recordings of one kind as one: files of a night, one after the other."""
 
 from __future__ import annotations
@@ -69,14 +70,18 @@ class Series:
         for source in self._sources:
             source.close()
 
-    def frames(self, say: Callable[[str], None]) -> Iterator[Frame | Skipped]:
+    def frames(
+        self, say: Callable[[str], None], first: int = 0
+    ) -> Iterator[Frame | Skipped | None]:
         """See `Source`."""
         number = 0
         attitudes: tuple[Attitude, ...] = ()  # after the last frame of the one before
         for source in self._sources:
             try:
-                for given in source.frames(say):
-                    if isinstance(given, Skipped):
+                for given in source.frames(say, max(0, first - number)):
+                    if given is None:
+                        yield None
+                    elif isinstance(given, Skipped):
                         yield replace(given, name=f"{given.name} of {source.path.name}")
                     else:
                         both = (*attitudes, *given.attitudes)

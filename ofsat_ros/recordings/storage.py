@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """One file of a bag: read by its library, and where that fails, salvaged."""
 
 from __future__ import annotations

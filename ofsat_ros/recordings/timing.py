@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The order of images in files, and when each was exposed: by their headers, or by a rate."""
 
 from __future__ import annotations

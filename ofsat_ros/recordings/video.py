@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Video files, as far as OpenCV reads them."""
 
 from __future__ import annotations
@@ -73,13 +74,17 @@ class VideoSource:
             self._video.release()
             self._video = None
 
-    def frames(self, say: Callable[[str], None]) -> Iterator[Frame | Skipped]:
+    def frames(
+        self, say: Callable[[str], None], first: int = 0
+    ) -> Iterator[Frame | Skipped | None]:
         """See `Source`."""
         number, start_ns = 0, self._hints.first_ns or 0
         for file, count in zip(self._files, self._counts, strict=True):
             before = number
             for image in self._images(file, count):
-                if image is None:
+                if number < first:
+                    yield None
+                elif image is None:
                     name = f"frame {number} ({file.name})"
                     yield Skipped(name, "the file ends within it, or after it")
                 else:

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What was found, in the forms in which others read it.
 
 Stands after the pipeline: the command ``ofsat process`` and the nodes write through here, so that
@@ -5,6 +6,7 @@ a result reads the same whoever made it: CSV files (tables.py), messages (messag
 them (bag.py), and ``run.json``, which says how they were made (run.py).
 """
 
+from ofsat_ros.results.reading import read_table
 from ofsat_ros.results.run import RUN, ResultError, read_run, write_run, write_whole
 from ofsat_ros.results.tables import (
     DETECTION_COLUMNS,
@@ -31,6 +33,7 @@ __all__ = [
     "detection_lines",
     "in_words",
     "read_run",
+    "read_table",
     "write_run",
     "write_whole",
 ]

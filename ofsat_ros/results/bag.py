@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """A bag of results, that plays beside the recording they are of.
 
 It holds what a detector would have published, made without ROS: the same messages

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The messages of results, whichever library's classes they are made of.
 
 What ``rso_detections``, ``rso_tracks``, ``flow_markers`` and ``star_field_motion`` hold is said

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """``run.json``: what a folder of results was made of, how, and what it did not tell.
 
 With it a folder explains itself: the report reads it, and opens the recording again.
@@ -26,6 +27,8 @@ _KINDS: dict[str, tuple[type, ...]] = {
     **dict.fromkeys(("live", "stopped"), (bool,)),
     "recording": (str, list),
 }
+# Those that not every run has.
+_OTHERS: dict[str, tuple[type, ...]] = {"content": (str,), "key": (str,), "segment": (dict,)}
 # And what is in those that hold several.
 _PARTS: dict[str, tuple[type, ...]] = {
     "recording": (str,),
@@ -55,7 +58,9 @@ def write_run(folder: str | Path, run: Mapping[str, Any]) -> None:
         all null without a frame; ``started_utc`` (ISO 8601) and ``seconds`` it took; ``profile``,
         seconds by stage; ``problems``, the notes that the user was given; ``unlocated``, counts of
         detections without direction by the reason; ``files`` made; ``stopped``, whether the run
-        ended before the recording did.
+        ended before the recording did.  Of a batch, ``content``, the hash of the recording's
+        files, and ``key``, that of all that decides the result; of a segment that is still to be
+        joined with others, ``segment``, what that needs.
 
     Raises
     ------
@@ -130,9 +135,10 @@ def read_run(folder: str | Path) -> dict[str, Any]:
 
 def _fits(name: str, value: Any) -> bool:
     """Whether a field holds what it should."""
-    if value is None or name not in _KINDS:
+    kinds = _KINDS | _OTHERS
+    if value is None or name not in kinds:
         return True
-    if not isinstance(value, _KINDS[name]):
+    if not isinstance(value, kinds[name]):
         return False
     parts = value.values() if isinstance(value, dict) else value if type(value) is list else ()
     return name not in _PARTS or all(isinstance(part, _PARTS[name]) for part in parts)

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The columns of ``detections.csv``, ``tracks.csv`` and ``star_field.csv``.
 
 Times are int ns UTC, angles in deg, unknown is ``nan``.
@@ -167,6 +168,10 @@ class ResultWriter:
     def add_star_field(self, result: FrameResult) -> None:
         """Write the star field's motion in one frame."""
         _write(self._star_field, _star_field_line(result))
+
+    def copy_star_field(self, line: str) -> None:
+        """Write a line of another ``star_field.csv``."""
+        _write(self._star_field, line)
 
     def close(self) -> None:
         """Write the tracks and close the files."""

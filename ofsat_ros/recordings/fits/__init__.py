@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """FITS files and folders of them: images, cubes, extensions, compressed or not.
 
 What a header means is the FITS standard's (version 4.0, 2018).  What that leaves open is settled
@@ -79,7 +80,9 @@ class FitsSource:
             self._file.close()
             self._file = None
 
-    def frames(self, say: Callable[[str], None]) -> Iterator[Frame | Skipped]:
+    def frames(
+        self, say: Callable[[str], None], first: int = 0
+    ) -> Iterator[Frame | Skipped | None]:
         """See `Source`."""
         said: set[str] = set()
         self._calibrated = (Path(), 0), None
@@ -90,6 +93,9 @@ class FitsSource:
                 say(words)
 
         for number, shot in enumerate(self._shots):
+            if number < first:
+                yield None
+                continue
             try:
                 yield self._frame(number, shot, say_once)
             except (RecordingError, EncodingError) as error:

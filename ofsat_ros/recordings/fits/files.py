@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """A FITS file: which images are in it, which of them are whole, and their pixels."""
 
 from __future__ import annotations

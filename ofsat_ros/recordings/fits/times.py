@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """When a FITS image was exposed, by its header (FITS standard 4.0, section 9)."""
 
 from __future__ import annotations

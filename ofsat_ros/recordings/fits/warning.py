@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Astropy's warnings, which are not for the terminal: problems say what matters of them."""
 
 from __future__ import annotations

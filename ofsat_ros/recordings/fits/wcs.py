@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """A FITS header's world coordinates as a camera and its attitude.
 
 A camera of `ofsat_ros.camera` and a zenithal projection of the FITS standard (M. Calabretta, E.

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What is whole in a file of a bag that its library cannot read: torn, half written, damaged.
 
 It stands beside the libraries' readers, and is slower: ``Salvage`` looks through the whole file at

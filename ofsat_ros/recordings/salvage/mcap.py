@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """MCAP from record to record: without footer and index, cut anywhere, with damaged chunks.
 
 Every record tells its length, so one that is damaged inside costs itself only; where a length is

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """A ROS 1 bag from record to record: not indexed, cut anywhere, with damaged chunks.
 
 Source of the layout: the rosbag format, version 2.0.

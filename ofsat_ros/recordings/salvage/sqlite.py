@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """A database of rosbag2 page by page: cut anywhere, with damaged pages, or left open.
 
 A message is a row of the table ``messages``, which is a cell in a leaf page and a chain of
