@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """A headless Chromium over its DevTools pipe: what a page looks like and says."""
 
 from __future__ import annotations

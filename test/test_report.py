@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Annotated pictures: what is drawn, where, and in which colour."""
 
 import math

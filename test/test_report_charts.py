@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Charts of the report: what stands where, and words and numbers as people write them."""
 
 import math

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Pictures of the report: what stands still in them, what is gone, and where things lie."""
 
 import json

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The report on a run: its page in a real browser, its film, and what both start from."""
 
 import math

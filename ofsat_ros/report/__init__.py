@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """For people: frames with what was found drawn on them, and a report on a whole recording.
 
 `annotate` and `summary` are of one frame, live (picture.py).  `write_report` makes a page

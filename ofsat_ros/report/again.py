@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The recording that results are of, looked at a second time: where all pictures come from."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Small charts over time, as SVG that takes its colours from the page.
 
 Made here, and not by a plotting library, since a report holds hundreds: one of these weighs a few

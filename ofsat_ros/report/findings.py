@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What a folder of results tells: its tables, and each track's path about a smooth motion.
 
 The first step of a report: everything after it, pictures, charts and words, starts from
@@ -6,7 +7,6 @@ The first step of a report: everything after it, pictures, charts and words, sta
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,13 +20,12 @@ from ofsat_ros.results import (
     DETECTIONS,
     STAR_FIELD,
     STAR_FIELD_COLUMNS,
-    ResultError,
     read_run,
+    read_table,
 )
 
 Array = NDArray[np.float64]
 
-_WHOLE = {"stamp_ns", "frame", "track_id", "confirmed", "stars", "objects", "detections"}
 # A smooth motion is a polynomial of time; so many detections allow each degree.
 _LEAST_FOR_DEGREE = (1, 3, 8, 20)
 
@@ -97,6 +96,11 @@ class Track:
     def speed(self) -> float:
         """Median speed against the stars, px/s."""
         return float(np.median(np.hypot(self.rows["rel_vx_px_s"], self.rows["rel_vy_px_s"])))
+
+    @property
+    def sigma(self) -> Array:
+        """Stated std of each detection's place, of an axis, (K,) px."""
+        return np.sqrt((self.rows["sigma_x_px"] ** 2 + self.rows["sigma_y_px"] ** 2) / 2)
 
     @property
     def is_followed(self) -> bool:
@@ -201,8 +205,8 @@ def read_findings(folder: Path) -> Findings:
     run = read_run(folder)
     for count in ("frames", "width", "height"):
         run[count] = max(run[count] or 0, 0)
-    detections = _read(folder / DETECTIONS, DETECTION_COLUMNS)
-    frames = _read(folder / STAR_FIELD, STAR_FIELD_COLUMNS)
+    detections = read_table(folder / DETECTIONS, DETECTION_COLUMNS)
+    frames = read_table(folder / STAR_FIELD, STAR_FIELD_COLUMNS)
     centre = (run["width"] - 1) / 2, (run["height"] - 1) / 2
     to_sky, stretch = _follow_stars(frames, centre)
     rows = {int(number): row for row, number in enumerate(frames["frame"])}
@@ -221,34 +225,6 @@ def _track(number: int, rows: NDArray[np.void], to_sky: Array) -> Track:
     sky = np.einsum("kij,kj->ki", to_sky, places)[:, :2]
     turns = np.linalg.inv(to_sky)[:, :2, :2].astype(np.float64)
     return Track(number, rows, sky, turns)
-
-
-def _read(path: Path, columns: tuple[str, ...]) -> NDArray[np.void]:
-    """Read a table that ``ResultWriter`` wrote; a last line that was cut off is left out."""
-    dtype = np.dtype([(name, _kind(name)) for name in columns])
-    if not path.is_file():
-        raise ResultError(f"{path.parent} holds no {path.name}: run ofsat process again")
-    # What a crash has left at the end may be anything.
-    with path.open(encoding="utf-8", errors="replace", newline="") as file:
-        lines = list(csv.reader(file))
-    if not lines or tuple(lines[0]) != columns:
-        raise ResultError(f"{path} has other columns than this version writes: process again")
-    if len(lines) > 1 and len(lines[-1]) != len(columns):
-        lines.pop()
-    for number, line in enumerate(lines[1:], 2):
-        if len(line) != len(columns):
-            raise ResultError(f"{path} is damaged in line {number}; run ofsat process again")
-    table = np.zeros(len(lines) - 1, dtype)
-    try:
-        for name, cells in zip(columns, zip(*lines[1:], strict=True), strict=False):
-            table[name] = cells if name == "note" else np.array(cells).astype(dtype[name])
-    except ValueError as error:
-        raise ResultError(f"{path} is damaged: {error}; run ofsat process again") from error
-    return table
-
-
-def _kind(name: str) -> str:
-    return "O" if name == "note" else "i8" if name in _WHOLE else "f8"
 
 
 def _follow_stars(

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """``report.html``: a folder of results as one page that needs nothing else.
 
 The last step of ``ofsat process``, and all of ``ofsat report``.  Reads the folder (`findings`) and
@@ -22,10 +23,10 @@ from ofsat_ros.report.again import open_again, processed
 from ofsat_ros.report.charts import Series, chart, sparkline
 from ofsat_ros.report.findings import Findings, Track, read_findings
 from ofsat_ros.report.looks import CutOuts, Gallery, Sky, View
+from ofsat_ros.report.template import page_template
 from ofsat_ros.results import ResultError, write_whole
 
 REPORT = "report.html"
-_TEMPLATES = Path(__file__).with_name("page")
 # Tracks with cut-outs and charts, and rows of the table of tracks.
 _GALLERIES, _ROWS = 40, 400
 _COLOURS = 8
@@ -71,12 +72,7 @@ def write_report(
     OSError
         If a file cannot be read, or written.
     """
-    try:
-        from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "the report needs jinja2: pip install 'ofsat_ros[report]'", name=error.name
-        ) from error
+    template = page_template("page.html")
     folder = Path(folder)
     findings = read_findings(folder)
     views: list[View] = []
@@ -89,18 +85,7 @@ def write_report(
             raise
         no_pictures = f"no pictures: {error}"
         say(f"note: {REPORT} has {no_pictures}")
-    environment = Environment(
-        loader=FileSystemLoader(_TEMPLATES),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=StrictUndefined,
-    )
-    environment.filters |= {
-        **{"number": words.number, "instant": words.instant, "duration": words.duration},
-        **{"plural": words.count},
-    }
-    page = environment.get_template("page.html").render(
+    page = template.render(
         **_about(findings),
         no_pictures=no_pictures,
         views=[_view(view, findings) for view in views],
@@ -215,17 +200,12 @@ def _tracks(findings: Findings, galleries: dict[int, Gallery]) -> list[dict[str,
                 "to": words.sexagesimal(last["ra_deg"], last["dec_deg"]),
                 "spark": sparkline(rows["flux"], _style(i)),
                 "smooth": track.smooth,
-                "sigma": _stated_sigma(track),
+                "sigma": float(np.median(track.sigma)),
                 "gallery": _gallery(galleries.get(track.number)),
                 "charts": _track_charts(track, findings, _style(i)) if i < _GALLERIES else [],
             }
         )
     return listed
-
-
-def _stated_sigma(track: Track) -> float:
-    rows = track.rows
-    return float(np.sqrt(np.median((rows["sigma_x_px"] ** 2 + rows["sigma_y_px"] ** 2) / 2)))
 
 
 def _gallery(gallery: Gallery | None) -> dict[str, Any] | None:
@@ -248,7 +228,6 @@ def _track_charts(track: Track, findings: Findings, style: str) -> list[tuple[st
         error = 2.5 / np.log(10) / rows["snr"]
     velocity = rows["rel_vx_px_s"], rows["rel_vy_px_s"]
     heading = np.degrees(np.unwrap(np.arctan2(velocity[1], velocity[0])))
-    sigma = np.sqrt((rows["sigma_x_px"] ** 2 + rows["sigma_y_px"] ** 2) / 2)
     residuals = track.smooth.residuals
     made = [
         (
@@ -283,7 +262,7 @@ def _track_charts(track: Track, findings: Findings, style: str) -> list[tuple[st
                     Series("", residuals[:, 0], style, True),
                 ],
                 unit,
-                band=sigma,
+                band=track.sigma,
                 label=f"residuals of {number}",
             )
             if np.isfinite(residuals).any()

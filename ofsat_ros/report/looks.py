@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Pictures out of the recording, in one pass over it: the deep sky, and cut-outs of each track.
 
 `Sky` lays the frames on each other, on the stars and on the sensor; `CutOuts` keeps what lies

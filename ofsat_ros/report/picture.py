@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Pictures of what was found: the last step, for people.
 
 `annotate` draws one frame; the detector node publishes it, the recorder keeps some of them.

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """A film of a recording with what was found in it: a folder of results, looked at once more.
 
 Unlike the live picture it knows how each track went on: a track has its id from its first frame.
@@ -90,8 +91,9 @@ def write_video(folder: str | Path, path: str | Path, recording: str | Path | No
                     show(_sized(picture, side))
         os.replace(unfinished, path)
     except OSError as error:
-        if error.filename in (None, f"{unfinished}"):  # as of a disk that is full
-            error.filename = f"{path}"
+        if error.errno and error.filename in (None, f"{unfinished}"):  # as of a disk that is full
+            # Anew: PyAV's errors cannot be given another name.
+            raise OSError(error.errno, error.strerror, f"{path}") from error
         raise
     finally:
         with suppress(OSError):  # the folder may be gone

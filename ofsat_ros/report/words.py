@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What a report says in words: the sentence on top, and numbers as people write them."""
 
 from __future__ import annotations
@@ -5,7 +6,9 @@ from __future__ import annotations
 import math
 import shlex
 from collections import Counter
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -158,31 +161,42 @@ def recordings(run: dict[str, Any]) -> list[str]:
 
 def command_line(run: dict[str, Any]) -> str:
     """Return the command that gives these results again, with this version's presets."""
-    words = ["ofsat", "process", *(recordings(run) or ["RECORDING"]), "-o", "results"]
-    for name in ("topic", "camera_info_topic", "attitude_topic", "fps", "exposure_s", "start_ns"):
-        if run.get(name) not in (None, ""):
-            value = run[name] if name != "start_ns" else utc_text(run[name])
-            words += [_OPTIONS.get(name, _option(name)), f"{value}"]
+    options = {name: run.get(name) for name in _SOURCE}
     preset = run.get("preset") or ""
     try:
         of_preset = Parameters.preset(preset).as_dict()
     except ParameterError:
         of_preset = {}
-    if not preset or (of_preset and of_preset != Parameters().as_dict()):
-        words += ["--preset", preset] if preset else []
+    if of_preset and of_preset != Parameters().as_dict():
+        options["preset"] = preset
     for about, value, _ in parameters_used(run):
         if value != of_preset.get(about.name, about.default):
-            words += [
-                _option(about.name),
-                f"{value}".lower() if isinstance(value, bool) else f"{value}",
-            ]
-    if run.get("live"):
-        words.append("--live")
-    return shlex.join(words)
+            options[about.name] = value
+    words = process_words(recordings(run) or ["RECORDING"], options)
+    return shlex.join([*words, "--live"] if run.get("live") else words)
 
 
-_OPTIONS = {"exposure_s": "--exposure", "start_ns": "--start"}
+# Options of `open_recording`, and those that the command line has other names for.
+_SOURCE = ("topic", "camera_info_topic", "attitude_topic", "fps", "exposure_s", "start_ns")
+_NAMES = {"exposure_s": "--exposure", "start_ns": "--start"}
 
 
-def _option(name: str) -> str:
-    return "--" + name.replace("_", "-")
+def process_words(paths: Iterable[str | Path], options: Mapping[str, Any]) -> list[str]:
+    """Return the words of the command that processes recordings.
+
+    Parameters
+    ----------
+    paths : iterable of str or Path
+    options : mapping of str to any
+        By their names in Python; None or empty if not given.
+    """
+    words = ["ofsat", "process", *map(str, paths), "-o", "results"]
+    for name, value in options.items():
+        if value is None or value == "":
+            continue
+        if name == "start_ns":
+            value = utc_text(value)
+        elif isinstance(value, bool):
+            value = f"{value}".lower()
+        words += [_NAMES.get(name, f"--{name.replace('_', '-')}"), f"{value}"]
+    return words
