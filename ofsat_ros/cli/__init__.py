@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The ``ofsat`` command: what needs no ROS graph.
 
 Each command is a module of this package, which is imported only when it is called; ``terminal`` is
@@ -20,7 +21,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from ofsat_ros import __version__
-from ofsat_ros.cli.interruption import interruptible, nothing_to_finish
+from ofsat_ros.cli.interruption import interrupted, interruptible, nothing_to_finish
 from ofsat_ros.printing import printable
 
 __all__ = ["main"]
@@ -31,6 +32,8 @@ _COMMANDS = {
     "import": "Turn FITS, SER, video or images into a bag.",
     "suggest": "Propose parameters that suit a recording.",
     "process": "Detect RSOs in a recording.",
+    "batch": "Detect RSOs in many recordings, on many cores or machines.",
+    "catalog": "List tracks of many recordings by time, place, rate, brightness.",
     "report": "Make a page, or a video, of results.",
     "evaluate": "Compare results with truth.",
     "simulate": "Make a recording of simulated frames.",
@@ -94,6 +97,9 @@ class _Commands(click.Group):
             click.echo("stopped", err=True)
             sys.exit(130)
         except Exception as error:
+            if interrupted(error):
+                click.echo("stopped", err=True)
+                sys.exit(130)
             if ctx.params["debug"]:
                 raise
             raise _Failure(

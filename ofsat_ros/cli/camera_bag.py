@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The bag of one camera that commands write: its images, and what gives their directions."""
 
 from __future__ import annotations
@@ -84,6 +85,15 @@ def left(work: Unfinished | None, bag: CameraBag | None, failed: bool = False) -
     count = "what could be written is" if failed else f"{bag.frames} frames are"
     words = f"{count} in {work.folder / bag.path.name}"
     return f"{words}, and the earlier bag is as it was" if work.kept else words
+
+
+bag_output = click.option(
+    "-o",
+    "--output",
+    required=True,
+    type=click.Path(path_type=Path),
+    help="bag to make: a new folder",
+)
 
 
 def bag_options(command: Callable[..., None]) -> Callable[..., None]:

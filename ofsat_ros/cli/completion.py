@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """``ofsat completion``: what makes a shell complete commands, options and their values."""
 
 from __future__ import annotations

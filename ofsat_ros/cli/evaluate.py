@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """``ofsat evaluate``: results against truth."""
 
 from __future__ import annotations

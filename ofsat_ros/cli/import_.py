@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """``ofsat import``: any recording into a bag."""
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from typing import Any
 import click
 from tqdm import tqdm
 
-from ofsat_ros.cli.camera_bag import CameraBag, bag_folder, bag_options, left
+from ofsat_ros.cli.camera_bag import CameraBag, bag_folder, bag_options, bag_output, left
 from ofsat_ros.cli.terminal import (
     fail,
     help_all,
@@ -27,13 +28,7 @@ _NOTES_SHOWN = 10
 @click.argument(
     "recordings", metavar="INPUT...", nargs=-1, required=True, type=click.Path(path_type=Path)
 )
-@click.option(
-    "-o",
-    "--output",
-    required=True,
-    type=click.Path(path_type=Path),
-    help="bag to make: a new folder",
-)
+@bag_output
 @recording_options
 @bag_options
 @help_all

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """``ofsat info``: what a recording holds, and whether it can be processed."""
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ from ofsat_ros.cli.survey import survey
 from ofsat_ros.cli.terminal import (
     fail,
     help_all,
-    process_words,
     recording_argument,
     recording_options,
 )
 from ofsat_ros.printing import printable
 from ofsat_ros.recordings import RecordingError, Topic, TopicError, open_recording
+from ofsat_ros.report.words import process_words
 
 _PATHS_SHOWN = 3
 

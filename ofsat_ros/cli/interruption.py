@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Ctrl-C, SIGTERM and the end of the terminal: each stops a command, whenever it comes.
 
 Python raises KeyboardInterrupt wherever the main thread is at that moment, and drops it where
@@ -56,6 +57,13 @@ def nothing_to_finish() -> Iterator[None]:
     finally:
         for number, handler in usual.items():
             signal.signal(number, handler)
+
+
+def interrupted(error: BaseException | None) -> bool:
+    """Return whether it is an interruption at root: modules in C make an ImportError of one."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _end(*_: object) -> None:

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """``ofsat report``: a page, or a video, of results that are there."""
 
 from __future__ import annotations
@@ -7,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from ofsat_ros.cli.terminal import fail, say
+from ofsat_ros.cli.terminal import fail, say, spare_existing
 from ofsat_ros.recordings import RecordingError
 from ofsat_ros.report import write_report, write_video
 from ofsat_ros.results import ResultError
@@ -34,10 +35,9 @@ def command(results: Path, recording: Path | None, video: Path | None, force: bo
     """
     if recording is not None and not recording.exists():
         fail(f"there is nothing at {recording}")
-    if video is not None and video.exists() and not force:
-        fail(f"{video} exists: choose another name, or --force to replace it")
     made: list[Path] = []
     try:
+        spare_existing(video, force)
         made.append(write_report(results, recording, say))
         if video is not None:
             made.append(write_video(results, video, recording))

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """``ofsat simulate``: a recording of simulated frames, with truth."""
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from typing import Any
 import click
 from tqdm import tqdm
 
-from ofsat_ros.cli.camera_bag import CameraBag, bag_folder, bag_options, left
+from ofsat_ros.cli.camera_bag import CameraBag, bag_folder, bag_options, bag_output, left
 from ofsat_ros.cli.terminal import fail, say
 from ofsat_ros.parameters import ParameterError
 from ofsat_ros.recordings import RecordingError
@@ -19,13 +20,7 @@ from ofsat_ros.simulation import SCENARIOS, scenario, write_truth
 @click.command(
     "simulate", epilog="Example: ofsat simulate -o my_sky --scenario geo --seed 7 --frames 60"
 )
-@click.option(
-    "-o",
-    "--output",
-    required=True,
-    type=click.Path(path_type=Path),
-    help="bag to make: a new folder; its truth is written beside it as OUTPUT.truth.csv",
-)
+@bag_output
 @click.option(
     "--scenario",
     "name",
@@ -53,7 +48,7 @@ def command(
     compressed: bool,
     force: bool,
 ) -> None:
-    """Make a bag of simulated frames, with the truth of what is in them."""
+    """Make a bag of simulated frames, and beside it their truth as OUTPUT.truth.csv."""
     changes: dict[str, Any] = {"frames": frames, "bit_depth": bit_depth}
     if size:
         changes.update(width=size[0], height=size[1])

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """``ofsat suggest``: parameters that suit a recording, with the reasons."""
 
 from __future__ import annotations
@@ -15,13 +16,14 @@ import click
 from ofsat_ros.cli.terminal import (
     fail,
     help_all,
-    process_words,
     recording_argument,
     recording_options,
     say,
+    spare_existing,
 )
 from ofsat_ros.pipeline import ImageError
 from ofsat_ros.recordings import RecordingError, open_recording
+from ofsat_ros.report.words import process_words
 from ofsat_ros.suggestion import Measurement, Suggestion, measure, suggest
 
 
@@ -62,8 +64,7 @@ def command(
 ) -> None:
     """Propose parameters for RECORDING: how much to smooth, what history, and why."""
     try:
-        if file is not None and file.exists() and not force:
-            raise RecordingError(f"{file} exists: choose another name, or --force to replace it")
+        spare_existing(file, force)
         with open_recording(paths, **options) as recording:
             measured = measure(islice(recording, count))
             for problem in recording.problems:

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What the frames of a recording tell of it: sizes, times, gaps, directions."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Where a command makes its files, until they are whole and take their place.
 
 So a run that fails, or is killed, harms nothing that was there.  What it has made so far can be

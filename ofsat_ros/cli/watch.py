@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """``ofsat watch``: the node of that name, for those who are on ssh without a screen."""
 
 from __future__ import annotations
