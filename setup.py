@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Install ofsat_ros, for pip and for colcon alike."""
 
 import re
@@ -27,16 +28,19 @@ LINT = ["mypy>=2.4,<3", "pip-audit", "ruff>=0.17,<0.18", "types-PyYAML", "types-
 SKY = ["astropy>=5.3"]  # the first that reads parts of compressed images
 PLOT = ["matplotlib"]
 REPORT = ["av", "jinja2", "pillow"]
+CLUSTER = ["cryptography", "distributed>=2025.1"]  # the first for encryption on one machine, too
 BENCH = ["sgp4", *PLOT, *SKY]
+DOCS = ["pdoc>=16"]
 TEST = [
+    "catkin_pkg",  # reads package.xml and the changelog as bloom does
     "colcon-core",
     "colcon-ros",
     "hypothesis",
     "mcap",  # writes what we read
-    "pytest>=9",
+    "pytest>=7.4",  # Ubuntu 24.04's
     "pytest-xdist",
     "sep",
-    *(*SKY, *PLOT, *REPORT, "sgp4"),
+    *(*SKY, *PLOT, *REPORT, *CLUSTER, *DOCS, "sgp4"),
     *("ccsds-ndm", "lxml"),  # reads back what we write; GPL, so for tests only
     "setuptools>=70.1,<80",  # the range in which colcon and pip can both build with it
 ]
@@ -79,9 +83,11 @@ setup(
         "fits": SKY,
         "exif": ["pillow"],
         "report": REPORT,
+        "cluster": CLUSTER,
         "lint": LINT,
         "test": TEST,
         "bench": BENCH,
+        "docs": DOCS,
         "all": [*ROS, *SKY, *PLOT, *REPORT, *LINT, *TEST, *BENCH],
     },
     entry_points={

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The package as users get it: built by colcon, installed by pip, described by package.xml."""
 
 import ast
@@ -40,7 +41,7 @@ PIP_NAMES = {"yaml": "PyYAML"}
 # What only some commands and tests need, and pip's extras bring: imported where it is used.
 EXTRAS = {
     *("PIL", "astropy", "av", "ccsds_ndm", "erfa", "jinja2", "matplotlib", "mcap", "sgp4"),
-    "xsdata",
+    *("catkin_pkg", "dask", "distributed", "packaging", "psutil", "xsdata"),
 }
 DEADLINE_S = 30.0
 SAMPLE_BAG = "bags/survey_png"
