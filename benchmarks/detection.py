@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What is detected, and what is invented: the robust method beside the paper's and peers.
 
 ``python -m benchmarks.detection --bench FOLDER`` runs every method over the same sequences and

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What theory allows: how faint a point source may be to be found, and how well it is placed.
 
 Stands beside `sensitivity`, which measures both.  The noise is white and Gaussian, and so is the

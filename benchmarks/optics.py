@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What parameters are worth that unusual optics call for: the table of docs/optics.md.
 
 ``python -m benchmarks.optics`` renders skies with another PSF, rate or sensor each, processes them

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The paper's results, reproduced: both engines over its two scenes, with its noise.
 
 ``python -m benchmarks.paper`` prints Markdown tables: the published presets, sparse beside dense,

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Peers of the package for benchmarks/detection.py: what a careful user makes of SExtractor.
 
 Both begin with `sep`, SExtractor's algorithms as a library: background mesh, matched filter,

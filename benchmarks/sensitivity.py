@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """How faint an RSO may be, and how well its place is measured: both beside what theory allows.
 
 ``python -m benchmarks.sensitivity`` renders RSOs of known SNR in three kinds of motion, runs the

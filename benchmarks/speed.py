@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """How fast `Pipeline` is, and how much memory it takes, beside yardsticks of the same run.
 
 ``python -m benchmarks.speed`` prints Markdown tables.  Times on shared machines drift, so each is
@@ -14,7 +15,6 @@ import argparse
 import io
 import os
 import platform
-import resource
 import subprocess
 import sys
 import tempfile
@@ -205,8 +205,9 @@ def _timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
 
 
 def _peak_bytes() -> float:
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+    # Not getrusage: what it tells goes back to before the fork, to the process that started this.
+    status = Path("/proc/self/status").read_text()
+    return 1024 * int(status.partition("VmHWM:")[2].split()[0])
 
 
 def _resident_bytes() -> float:

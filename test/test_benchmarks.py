@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The benchmarks run, and say what their tables claim."""
 
 import os
@@ -5,10 +6,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import rclpy
 
-from benchmarks import speed, throughput
+from benchmarks import engines, speed, throughput
 
 ROOT = Path(__file__).parents[1]
 
@@ -30,6 +32,19 @@ def cells(text: str, name: str) -> list[str]:
     """The cells of the first row that begins with a name."""
     (line, *_) = [line for line in text.splitlines() if line.startswith(f"| {name} |")]
     return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def test_engines_beside_the_bound():
+    for name, method in engines.METHODS.items():
+        stars, whole = engines.compare(method, 50.0, np.array([0.37, -0.61]), 1)
+        # Two frames allow 0.04 px per axis; 8 bits over the whole range cost `paper_opencv` most.
+        assert len(stars) > 100, name
+        assert 0.04 < np.sqrt(np.mean(stars**2)) < 0.2
+        assert np.linalg.norm(whole) < 0.1
+    far = np.array([40.0, 30.0])
+    assert (
+        np.linalg.norm(engines.compare(engines.METHODS["`robust`, sparse"], 50.0, far, 1)[1]) < 0.1
+    )
 
 
 def test_detection_beside_its_peers():
@@ -117,6 +132,7 @@ def test_memory_and_command(rendered: Path):
     assert command_s > 0
 
 
+@pytest.mark.alone
 def test_frames_over_dds(tmp_path: Path):
     speed.render(tmp_path, SKY, 6, (0.0, 0.0))
     rclpy.init()

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Angles and orbits: an orbit comes back out of images of a satellite that flies it.
 
 ``python -m benchmarks.orbit`` takes a satellite's published elements and a site, finds a pass by

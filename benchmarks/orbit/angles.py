@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Angles of a tracking data message, and how far they are off."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What a camera sees of a pass: rendered into a bag, and processed by the command."""
 
 from __future__ import annotations
@@ -126,7 +127,8 @@ def _later(geometry: Geometry, satellite: Satrec, offset_s: float, times_s: Arra
 def process(case: Case, folder: Path) -> Path:
     """Run the command over the bag; return the tracking data message."""
     results = folder / "results"
-    command = ["process", f"{folder / 'bag'}", "--output", f"{results}", "--tdm", "kvn"]
+    command = ["process", f"{folder / 'bag'}", "--output", f"{results}", "--no-report"]
+    command += ["--tdm", "kvn"]
     command += ["--stamp-reference", "start", "--exposure-time-s", f"{case.settings.exposure_s}"]
     # The bursts are minutes apart, and in other parts of the sky.
     command += ["--max-gap-s", "10"]

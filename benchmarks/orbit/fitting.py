@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """An orbit from angles: SGP4's mean elements by least squares, and what they leave open."""
 
 from __future__ import annotations

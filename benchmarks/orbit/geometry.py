@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Where a site sees a satellite, and when a pass is to be seen."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The runs, their tables, and whether the targets are met."""
 
 from __future__ import annotations
