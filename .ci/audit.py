@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Ask an advisory service about every package that is installed here, and say what it knew.
 
 ``pip-audit`` ends well, with "No known vulnerabilities found", also where no service could be

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Make what README and docs show: pictures and the table of parameters.
 
 ``python docs/generate.py`` rewrites the files; ``test/test_readme.py`` says when that is due.

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """A folder of FITS files as a camera program leaves it, with plate solutions in the headers."""
 
 from pathlib import Path

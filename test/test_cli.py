@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """The ``ofsat`` command: files, words, exit codes, and what it finds in simulated recordings."""
 
 import csv
@@ -245,7 +246,9 @@ def test_process_has_an_option_for_every_parameter():
 @pytest.mark.parametrize("about", [*Parameters.describe()], ids=lambda about: about.name)
 def test_every_option_reaches_its_parameter(about, small: Path, tmp_path: Path, monkeypatch):
     given = []
-    monkeypatch.setattr("ofsat_ros.cli.process.Pipeline", lambda p: given.append(p) or Pipeline(p))
+    monkeypatch.setattr(
+        "ofsat_ros.processing.job.Pipeline", lambda p: given.append(p) or Pipeline(p)
+    )
     value = about.choices[-1] if about.choices else about.high
     if about.name == "dense_iterations":
         value = 2  # 20 rounds are not needed to see that it arrives

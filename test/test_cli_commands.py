@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What all commands of ``ofsat`` have in common: help, errors, exit codes, completion."""
 
 import errno
@@ -9,8 +10,7 @@ from pathlib import Path
 
 import click
 import pytest
-from click.testing import CliRunner
-from command import environment, fails, ofsat, succeeds
+from command import environment, fails, invoke, ofsat, succeeds
 
 from ofsat_ros.cli import main
 
@@ -29,9 +29,7 @@ def command(name: str) -> click.Command:
 def help_of(*arguments: str) -> list[str]:
     # In a terminal, click leaves two columns free.
     width = SCREEN[1] - 2
-    done = CliRunner().invoke(
-        main, [*arguments, "--help"], terminal_width=width, prog_name="ofsat"
-    )
+    done = invoke(*arguments, "--help", terminal_width=width, prog_name="ofsat")
     assert done.exit_code == 0
     return done.output.splitlines()
 
@@ -104,6 +102,13 @@ def test_a_mistake_of_ours_is_a_line_and_a_hint(monkeypatch: pytest.MonkeyPatch)
     said = fails(1, "completion", "bash")
     assert said.startswith("ofsat: IndexError: list index out of range This is a mistake in ofsat")
     assert "`ofsat --debug` in place of `ofsat` shows where" in said
+
+
+def test_an_interruption_that_a_module_in_c_turns_into_another_error_is_one(monkeypatch):
+    error = ImportError("initialization failed")
+    error.__cause__ = KeyboardInterrupt()
+    break_completion(monkeypatch, error)
+    assert fails(130, "completion", "bash") == "stopped"
 
 
 def test_debug_shows_where_a_mistake_is(monkeypatch: pytest.MonkeyPatch):

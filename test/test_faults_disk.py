@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Runs that are killed, and disks that are full: what was there stays, what is whole is read."""
 
 import json
@@ -19,6 +20,7 @@ from ofsat_ros.cli.process import UNFINISHED
 from ofsat_ros.pipeline import Pipeline
 from ofsat_ros.recordings import Bag, BagWriter, RecordingError, check_bag, hold, open_recording
 from ofsat_ros.recordings.held import temporary_folder
+from ofsat_ros.report import write_video
 from ofsat_ros.results import DETECTION_COLUMNS, STAR_FIELD_COLUMNS, read_run
 from ofsat_ros.tracking_data import remove_parts
 
@@ -224,6 +226,24 @@ def test_a_full_disk_costs_import_nothing_that_was_there(sky, tmp_path, storage)
     succeeds(*command, "--force")
     assert count_of(output) == 3 * FRAMES
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bag"]
+
+
+def test_a_disk_without_any_room_begins_no_bag(sky, tmp_path):
+    with files_of_at_most(0):
+        said = fails(1, "import", sky, "-o", tmp_path / "bag", "--storage", "sqlite3")
+    assert said.startswith(f"ofsat: cannot write {tmp_path}/bag.unfinished/bag: ")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_under_a_video_is_said_with_its_name(sky, tmp_path):
+    succeeds("process", sky, "-o", tmp_path / "out")
+    video = tmp_path / "night.mp4"
+    video.write_text("earlier")
+    with files_of_at_most(2000), pytest.raises(OSError, match="File too large") as error:
+        write_video(tmp_path / "out", video)
+    assert error.value.filename == f"{video}"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["night.mp4", "out"]
+    assert video.read_text() == "earlier"
 
 
 def test_ctrl_c_replaces_nothing(sky, tmp_path, monkeypatch):

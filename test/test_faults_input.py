@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """A camera that sends nonsense: each kind of it is named once, none is believed, none ends a node.
 
 Nonsense comes amid good frames of one satellite: it must be found again in the next ones, and
@@ -44,9 +45,8 @@ COLOUR = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4}
 BAYER = [f"bayer_{name}{bits}" for name in ("rggb", "bggr", "gbrg", "grbg") for bits in (8, 16)]
 ENCODINGS = [*MONO, *COLOUR, *BAYER]
 NO_SENDER = {"publication_sequence_number": None}
-# Frames of the scene, which of them are replaced, and by when the RSO is to be found again: three
-# frames make a track.
-FRAMES, BAD, RECOVERED = 12, (5, 6), 10
+# Frames of the scene, and which of them are replaced.
+FRAMES, BAD = 12, (5, 6)
 FUZZ = {
     "deadline": None,
     "derandomize": True,

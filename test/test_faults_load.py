@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """A viewer that hangs gets no more pictures until it takes them, and nobody waits for it."""
 
 import logging
@@ -10,6 +11,8 @@ from std_msgs.msg import Header
 
 from ofsat_ros.nodes.drawing import Drawing
 from ofsat_ros.pipeline import FrameResult
+
+pytestmark = pytest.mark.alone
 
 _PATIENCE_S = 20.0
 

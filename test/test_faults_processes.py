@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Processes of a night: killed, restarted, doubled, hung, told to end at the worst moment."""
 
 import fcntl
@@ -318,7 +319,7 @@ def test_every_node_says_how_it_is_as_aggregators_expect(tmp_path, monkeypatch):
         )
         graph.add(GuideNode(context=graph.context))
         graph.add(Recorder(STOP, context=graph.context))
-        graph.add(TdmWriter(STOP, context=graph.context))
+        graph.add(TdmWriter(context=graph.context))
         graph.until(lambda: {status.name for status in heard} == beside)
         # Without a detector none of them can do its work.
         for status in heard:

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """What a night does to the sky and the sensor: nothing is invented, what comes back is found.
 
 Each fault befalls a plain scene: stars that drift, two RSOs among them.

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """A sky that jumps: slews, gusts, dither, another field, a mount that flips; none invents an RSO.
 
 Each scene has RSOs that are really there, before and after, so that what is counted as false is

@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Time that goes wrong in the night: stamps doubled, late, bogus; clocks that are set."""
 
 import json
@@ -356,7 +357,7 @@ class Hearing:
 
 def test_one_bad_stamp_splits_no_file_of_tracking_data(tmp_path):
     with Graph("-p", f"output:={tmp_path / 'out'}") as graph:
-        writer = Hearing(graph, TdmWriter(threading.Event(), context=graph.context))
+        writer = Hearing(graph, TdmWriter(context=graph.context))
         bad = {5: cloud(3600), 9: cloud(-1_790_000_000), 13: cloud(11.5), 17: cloud(3600, 1)}
         sent = [
             c for k in range(25) for c in ([cloud(k, 1), bad[k]] if k in bad else [cloud(k, 1)])
@@ -374,7 +375,7 @@ def test_a_disk_that_hangs_holds_up_no_detection(tmp_path, monkeypatch):
     real = os.fsync
     monkeypatch.setattr("os.fsync", lambda number: (hangs.wait(2 * PATIENCE_S), real(number)))
     with Graph("-p", f"output:={tmp_path / 'out'}") as graph:
-        writer = Hearing(graph, TdmWriter(threading.Event(), context=graph.context))
+        writer = Hearing(graph, TdmWriter(context=graph.context))
         told = graph.listen(DiagnosticArray, "/diagnostics")
         writer.send(*(cloud(k, 1) for k in range(5)), *(cloud(k, 2) for k in range(5, 25)))
         graph.until(lambda: writer.node._counts["frames"] == 25, PATIENCE_S)
@@ -417,7 +418,7 @@ def test_a_recording_with_bad_stamps_is_processed_and_says_what_is_left_out(tmp_
     bag = write_bag(tmp_path / "night", [FRAMES[n] for n in order])
     done = succeeds("process", bag, "-o", tmp_path / "out")
     words = f"frame 6 is left out, and others like it: it has {SAME}"
-    assert words in " ".join(done.output.split())
+    assert words in " ".join(done.stderr.split())
     run_of = read_run(tmp_path / "out")
     assert (run_of["frames"], run_of["left_out"], run_of["tracks"]) == (len(FRAMES), 1, 1)
     assert any(words in problem for problem in run_of["problems"])

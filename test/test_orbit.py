@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """An orbit comes back out of rendered images, and an error of the time does not pass."""
 
 import math

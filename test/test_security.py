@@ -1,3 +1,4 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Nobody's bytes become code, paths, memory without end, or commands to a terminal.
 
 And what SROS 2 allows each node is what the node has.  docs/security.md tells the rest.
