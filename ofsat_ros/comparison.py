@@ -29,6 +29,8 @@ _FEW_STARS, _MANY_STARS = 3, 10
 _ON_PX, _ON_SHARE = 3.0, 0.25
 # A track is as near as this to where it is expected if the field goes on as it did, px.
 _NEAR_PX = 10.0
+# By a motion that is less sure than this, px, stars pass for what moves; hundredths are usual.
+_SUREST_PX = 0.25
 
 
 @dataclass(frozen=True)
@@ -171,6 +173,25 @@ def find_motion(
     inliers = np.zeros(len(flow), bool)
     inliers[valid] = motion.inliers
     return motion.with_inliers(inliers), believed
+
+
+def why_not_placed(motion: StarFieldMotion, expected: StarFieldMotion | None) -> str:
+    """Say why frames that a motion of the field leads to have no place beside those before.
+
+    Empty if they have.  While a mount slews, its rate changes within an exposure; stars are
+    streaks then that no motion fits, and would seem to have moved against each other.
+
+    Parameters
+    ----------
+    motion : StarFieldMotion
+        From the frame before.
+    expected : StarFieldMotion or None
+        The same if it goes on as before; None if that is not known.
+    """
+    sigma_px = float(np.sqrt(np.diag(motion.covariance)[:2]).max())
+    if expected is None or motion.is_about(expected) or sigma_px <= _SUREST_PX:
+        return ""
+    return f"the star field's motion has changed, and is known to {sigma_px:.1f} px only"
 
 
 def why_another_field(before: Seen, now: Seen, known: Array, moved: bool) -> str:

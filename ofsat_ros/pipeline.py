@@ -22,6 +22,7 @@ from ofsat_ros.comparison import (
     measure_flow,
     why_another_field,
     why_not_comparable,
+    why_not_placed,
 )
 from ofsat_ros.detection import (
     Drift,
@@ -263,8 +264,12 @@ class Pipeline:
             if why := why_another_field(previous, current, known, expected is not None):
                 self.reset(why)
                 return
+        with_history = parameters.rso_test == "history"
+        if with_history and motion is not None and (why := why_not_placed(motion, expected)):
+            self.reset(why)
+            return
         result.dt_s, result.flow, result.star_field = dt_s, flow, motion
-        if motion is None or parameters.rso_test == "history":
+        if motion is None or with_history:
             return
         with _timed(result.seconds, "detection"):
             result.detections = detect(

@@ -6,11 +6,13 @@ measured where something true could be mistaken.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from ofsat_ros.comparison import why_not_placed
 from ofsat_ros.detection import CONFIRMED
 from ofsat_ros.parameters import Parameters
 from ofsat_ros.pipeline import FrameResult, Pipeline
@@ -175,6 +177,21 @@ def test_nothing_is_invented_while_the_mount_slews(frames, far):
     assert any("jumped" in r.reset for r in results[JUMP : JUMP + frames + 1])
     for result in results[JUMP + frames + 1 :]:
         assert result.star_field.displacement == pytest.approx((0, 0), abs=0.1)
+
+
+def test_a_motion_that_changed_and_is_not_well_known_places_no_frame():
+    sky = Sky(1, drifting((9.0, -5.0)))
+    pipeline = Pipeline()
+    motion = [pipeline.process(sky.image(i), START_NS + i * SECOND_NS) for i in range(2)][1]
+    motion = replace(motion.star_field, covariance=0.3**2 * np.eye(4))
+    far = replace(motion, displacement=motion.displacement + (40.0, 0.0))
+    said = "the star field's motion has changed, and is known to 0.3 px only"
+    assert why_not_placed(motion, far) == said
+    # Few stars that go on as they did show no more, and are no slew; nor does a first motion tell.
+    assert why_not_placed(motion, motion) == ""
+    assert why_not_placed(motion, None) == ""
+    # Half an image further, with all stars: known as well as ever.
+    assert why_not_placed(replace(motion, covariance=0.02**2 * np.eye(4)), far) == ""
 
 
 def test_a_field_that_flips_is_another_one():
