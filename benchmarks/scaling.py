@@ -11,7 +11,6 @@ see that it works.
 from __future__ import annotations
 
 import argparse
-import pickle
 import subprocess
 import sys
 import tempfile
@@ -181,8 +180,6 @@ def parts(folder: Path, size: Size, frame_s: float) -> Iterator[tuple[str, str, 
             tasks = [(look, order, found[0], job, known)] * _TASKS
             each_s = taken(lambda: drain(cluster, tasks))
             yield "a recording that is known", f"{1e3 * each_s / _TASKS:.1f} ms", ""
-            size_b = len(pickle.dumps(tasks[0][1:]))
-            yield "what goes to a worker for a task", f"{size_b / 1e3:.1f} kB", ""
     files = [file for each in found for file in each.files if file.stat().st_size > _MB / 10]
     bytes_read = sum(file.stat().st_size for file in files)
     rate = bytes_read / taken(lambda: content_key(files)) / _MB

@@ -30,23 +30,18 @@ from ofsat_ros.cli.terminal import (
     fail,
     help_all,
     in_words,
-    parameter_options,
+    job_options,
     recording_options,
     say,
+    seldom_option,
 )
 from ofsat_ros.parameters import (
-    DEFAULT_PRESET,
-    CameraParameters,
     ParameterError,
-    Parameters,
-    TrackingDataParameters,
-    preset_names,
 )
 from ofsat_ros.recordings import RecordingError
 from ofsat_ros.report import REPORT
 from ofsat_ros.report.archive import NIGHTS, write_pages
 from ofsat_ros.results import ResultError
-from ofsat_ros.tracking_data import TRACKING_DATA
 
 _SOURCE = ("topic", "camera_info_topic", "attitude_topic", "fps", "exposure_s", "start_ns")
 # Without a terminal, how often it is told how far it is.
@@ -63,19 +58,20 @@ _SOME_FAILED = 3
     "--output",
     required=True,
     type=click.Path(file_okay=False, path_type=Path),
-    help=f"folder for results, {CATALOG} and pages; that of an earlier batch, to go on with it",
+    help=f"folder for results, {CATALOG} and pages; or of a batch, to go on with it",
 )
 @click.option(
     "--workers",
     type=click.IntRange(min=1),
+    metavar="COUNT",
     help="processes to work with here; default: one a core",
 )
 @click.option(
     "--scheduler",
     metavar="ADDRESS",
-    help="work on the cluster of this Dask scheduler, as tcp://host:8786 or tls://host:8786",
+    help="work on the cluster of this Dask scheduler, as tls://host:8786",
 )
-@click.option(
+@seldom_option(
     "--segment-frames",
     type=click.IntRange(min=0),
     default=500,
@@ -84,30 +80,7 @@ _SOME_FAILED = 3
     " many frames; 0: never; default: 500",
 )
 @recording_options
-@click.option(
-    "--report/--no-report",
-    default=None,
-    help="with or without a page on each recording; default: with, if its extra is there",
-)
-@click.option("--bag", is_flag=True, help="also write a bag of each recording's results")
-@click.option(
-    "--tdm",
-    "formats",
-    multiple=True,
-    type=click.Choice(list(TRACKING_DATA)),
-    help="also write angles: CCSDS TDM (text or XML) or IOD lines; repeatable",
-)
-@click.option(
-    "--preset",
-    default=DEFAULT_PRESET,
-    type=click.Choice(preset_names()),
-    metavar="NAME",
-    help=f"set of parameters: {', '.join(preset_names())}; default: {DEFAULT_PRESET}",
-)
-@click.option(
-    "--live", is_flag=True, help="write what the node says at each frame, not the last word on it"
-)
-@parameter_options(Parameters, CameraParameters, TrackingDataParameters)
+@job_options
 @help_all
 def command(
     places: tuple[Path, ...],
@@ -122,11 +95,7 @@ def command(
     live: bool,
     **options: Any,
 ) -> None:
-    """Process all recordings in DIR..., and make a catalogue of their tracks.
-
-    What is done already is not done again: after an interruption, or when there are new
-    recordings, give the same command.
-    """
+    """Process all recordings in DIR... and catalogue their tracks; given again, go on with it."""
     if scheduler and workers:
         raise click.UsageError("--workers is for this machine: a scheduler has workers of its own")
     source = {name: options.pop(name) for name in _SOURCE}

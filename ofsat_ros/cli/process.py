@@ -17,7 +17,7 @@ from ofsat_ros.cli.terminal import (
     fail,
     help_all,
     in_words,
-    parameter_options,
+    job_options,
     recording_argument,
     recording_options,
     say,
@@ -26,12 +26,7 @@ from ofsat_ros.cli.terminal import (
 )
 from ofsat_ros.cli.unfinished import Unfinished
 from ofsat_ros.parameters import (
-    DEFAULT_PRESET,
-    CameraParameters,
     ParameterError,
-    Parameters,
-    TrackingDataParameters,
-    preset_names,
 )
 from ofsat_ros.processing import SOURCE, Job, Run, Totals, Watch
 from ofsat_ros.recordings import RecordingError
@@ -58,39 +53,14 @@ UNFINISHED = "unfinished"
 )
 @recording_options
 @click.option(
-    "--report/--no-report",
-    default=None,
-    help=f"with or without {REPORT}; default: with, if its extra is there",
-)
-@click.option(
     "--video",
     type=click.Path(dir_okay=False, path_type=Path),
     help="also write the frames with what was found, to FILE.mp4 or .gif",
 )
-@click.option(
-    "--bag", is_flag=True, help=f"also write the bag {BAG}, that plays beside the recording"
-)
-@click.option(
-    "--tdm",
-    "formats",
-    multiple=True,
-    type=click.Choice(list(TRACKING_DATA)),
-    help="also write angles: CCSDS TDM (text or XML) or IOD lines; repeatable",
-)
-@click.option(
-    "--preset",
-    default=DEFAULT_PRESET,
-    type=click.Choice(preset_names()),
-    metavar="NAME",
-    help=f"set of parameters: {', '.join(preset_names())}; default: {DEFAULT_PRESET}",
-)
-@click.option(
-    "--live", is_flag=True, help="write what the node says at each frame, not the last word on it"
-)
+@job_options
 @click.option("--force", is_flag=True, help="replace the results of an earlier run")
 @click.option("--profile", is_flag=True, help="print a table of where the time went")
 @click.option("--json", "as_json", is_flag=True, help=f"print {RUN} instead of words")
-@parameter_options(Parameters, CameraParameters, TrackingDataParameters)
 @help_all
 def command(
     paths: tuple[Path, ...],

@@ -13,9 +13,19 @@ from typing import Any, NoReturn
 import click
 from tqdm import tqdm
 
-from ofsat_ros.parameters import Description, Table
+from ofsat_ros.parameters import (
+    DEFAULT_PRESET,
+    CameraParameters,
+    Description,
+    Parameters,
+    Table,
+    TrackingDataParameters,
+    preset_names,
+)
 from ofsat_ros.printing import printable
 from ofsat_ros.recordings import RecordingError, utc_ns
+from ofsat_ros.results.bag import BAG
+from ofsat_ros.tracking_data import TRACKING_DATA
 
 _Command = Callable[..., None]
 _ALL = f"{__name__}.all"
@@ -122,6 +132,45 @@ def recording_options(command: _Command) -> _Command:
         seldom_option("--attitude-topic", help="topic of the attitude, if there are several"),
         seldom_option("--camera-info-topic", help="topic of the calibration, if several"),
         click.option("--topic", help="image topic, if the recording holds several"),
+    ):
+        command = add(command)
+    return command
+
+
+def job_options(command: _Command) -> _Command:
+    """Add what a `Job` is told beside its recording, and whether a page is made of it."""
+    presets = preset_names()
+    for add in (
+        parameter_options(Parameters, CameraParameters, TrackingDataParameters),
+        click.option(
+            "--live",
+            is_flag=True,
+            help="write what the node says at each frame, not the last word on it",
+        ),
+        click.option(
+            "--preset",
+            default=DEFAULT_PRESET,
+            type=click.Choice(presets),
+            metavar="NAME",
+            help=f"set of parameters: {', '.join(presets)}; default: {DEFAULT_PRESET}",
+        ),
+        click.option(
+            "--tdm",
+            "formats",
+            multiple=True,
+            type=click.Choice(list(TRACKING_DATA)),
+            help="also write angles: CCSDS TDM (text or XML) or IOD lines; repeatable",
+        ),
+        click.option(
+            "--bag",
+            is_flag=True,
+            help=f"also write the bag {BAG}, that plays beside the recording",
+        ),
+        click.option(
+            "--report/--no-report",
+            default=None,
+            help="with or without a page on the recording; default: with, if its extra is there",
+        ),
     ):
         command = add(command)
     return command
