@@ -99,7 +99,7 @@ def test_comparison_says_why_there_is_none(repository: Path, tmp_path: Path) -> 
     with pytest.raises(compare.CompareError, match="git archive"):
         compare.check_out("no_such_revision", tmp_path / "earlier")
     compare.check_out("HEAD", tmp_path / "earlier")
-    with pytest.raises(compare.CompareError, match=r"earlier does not run: .*No module named"):
+    with pytest.raises(compare.CompareError, match="earlier does not run: "):
         compare.process(tmp_path / "earlier", tmp_path / "bag", tmp_path / "out")
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ofsat_ros.processing.job import SOURCE, Job, write_arcs
-from ofsat_ros.processing.output import Output, by_track
+from ofsat_ros.processing.output import Output
 from ofsat_ros.processing.run import Watch
 from ofsat_ros.processing.segments import RunOfSegment, Segment, by_frame
 from ofsat_ros.results import STAR_FIELD, ResultError, ResultWriter, read_run, write_run
@@ -274,7 +274,14 @@ def _copy(part: RunOfSegment, track_id: _TrackIds, output: Output) -> None:
         found = rows["detection"].copy()
         found["track_id"] = [track_id(each) for each in found["track_id"].tolist()]
         why = reasons[rows["why"][0]] if len(rows) else ""
-        output.add_detections(number, stamp_ns, by_track(found), why)
+        output.add_detections(number, stamp_ns, _by_birth(found), why)
+
+
+def _by_birth(detections: NDArray[np.void]) -> NDArray[np.void]:
+    """Return a frame's detections in the order of their tracks' births, candidates last."""
+    track_id = detections["track_id"].astype(np.int64)
+    order = np.where(track_id > 0, track_id, np.iinfo(np.int64).max)
+    return detections[np.argsort(order, kind="stable")]
 
 
 def _star_field_lines(folder: Path, numbers: set[int]) -> Iterator[str]:

@@ -20,13 +20,6 @@ from ofsat_ros.tracking_data import TrackArcs
 _RESETS_TOLD = 5
 
 
-def by_track(detections: NDArray[np.void]) -> NDArray[np.void]:
-    """Return a frame's detections in the order of their tracks' births, candidates last."""
-    track_id = detections["track_id"].astype(np.int64)
-    order = np.where(track_id > 0, track_id, np.iinfo(np.int64).max)
-    return detections[np.argsort(order, kind="stable")]
-
-
 class Output:
     """Takes what frames gave, in their order.
 

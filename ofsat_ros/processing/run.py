@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ofsat_ros.camera import Astrometry, Camera
 from ofsat_ros.pipeline import FrameResult, ImageError, Pipeline
-from ofsat_ros.processing.output import Output, by_track
+from ofsat_ros.processing.output import Output
 from ofsat_ros.processing.segments import SegmentRecord
 from ofsat_ros.recordings import Attitude, Frame, Recording
 from ofsat_ros.results import ResultWriter
@@ -213,7 +213,6 @@ class Processing:
 
     def _write(self, seen: _Seen, detections: Detections) -> None:
         stamp_ns, tracks = seen.result.stamp_ns, seen.result.tracks
-        detections = by_track(detections)
         self._astrometry.camera = seen.camera
         why = self._astrometry.locate(detections, stamp_ns)
         self._output.add_detections(seen.number, stamp_ns, detections, why)

@@ -31,6 +31,7 @@ class LastWord:
                 continue
             self._next = frame.number + 1
             seen = [track for track in tracks if frame.number in track.hits]
+            seen.sort(key=lambda track: track.track_id)
             rows = settled_rows(seen, frame, history)
             self._waiting.append(Settled(frame.number, frame.stamp_ns, rows))
 
