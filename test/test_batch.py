@@ -78,7 +78,7 @@ def told(out: Path) -> dict[str, dict]:
 def test_recordings_are_found_in_all_folders(tmp_path):
     bag = write_bag(tmp_path / "night1" / "bag")
     (tmp_path / "night1" / "sky").mkdir()
-    for name in ("a.fits", "b.fits", "preview.png"):
+    for name in ("a.fits", "b.fits", "preview.png", "beside.ser"):
         (tmp_path / "night1" / "sky" / name).touch()
     for name in ("iss.ser", "moon.ser", "notes.txt", ".hidden.ser"):
         (tmp_path / name).touch()
@@ -102,12 +102,13 @@ def test_recordings_are_found_in_all_folders(tmp_path):
     assert {(f.path.resolve().relative_to(tmp_path).as_posix(), f.kind) for f in found} == {
         ("night1/bag", "bag"),
         ("night1/sky", "FITS"),
+        ("night1/sky/beside.ser", "SER"),
         ("iss.ser", "SER"),
         ("moon.ser", "SER"),
         ("loose/one.mcap", "bag"),
         ("loose/two.mcap", "bag"),
     }
-    assert len(found) == 6
+    assert len(found) == 7
     (sky,) = (each for each in found if each.kind == "FITS")
     assert [file.name for file in sky.files] == ["a.fits", "b.fits"]
     assert find_recordings([bag], besides=tmp_path)[0].name == "bag"

@@ -25,6 +25,7 @@ class Found:
     Attributes
     ----------
     path : Path
+        Absolute, since workers may be elsewhere.
     kind : str
         ``bag``, ``FITS``, ``SER``, ``video`` or ``picture``; empty if the folder cannot be read.
     """
@@ -48,9 +49,9 @@ class Found:
 def find_recordings(places: Sequence[Path], besides: Path) -> list[Found]:
     """Return the recordings at some paths and in all folders below them, each once.
 
-    A folder with files of several kinds counts as `open_recording` reads it: by the first kind.
-    Results are not recordings, so folders that ``process`` or ``batch`` has made are passed over,
-    as are hidden ones.
+    Of FITS files and pictures, a folder has one recording at most: what `open_recording` reads of
+    it; pictures beside others are previews.  Results are not recordings, so folders that
+    ``process`` or ``batch`` has made are passed over, as are hidden ones.
 
     Parameters
     ----------
@@ -68,7 +69,8 @@ def find_recordings(places: Sequence[Path], besides: Path) -> list[Found]:
     for place in places:
         if not place.exists():
             raise RecordingError(f"{place} does not exist: check the path")
-        for each in _in_folder(place, besides) if place.is_dir() else _in_file(place):
+        at = place.absolute()
+        for each in _in_folder(at, besides) if at.is_dir() else _in_file(at):
             found.setdefault(each.path.resolve(), each)
     return list(found.values())
 
@@ -95,12 +97,13 @@ def _in_folder(top: Path, besides: Path) -> Iterator[Found]:
 
 
 def _directly_in(folder: Path, names: list[str]) -> Iterator[Found]:
-    for kind, files in files_by_kind([folder / name for name in names]).items():
-        if kind in _WHOLE or (kind == "bag" and _is_one(folder, files)):
+    by_kind = files_by_kind([folder / name for name in names])
+    first = next(iter(by_kind), "")
+    for kind, files in by_kind.items():
+        if kind == first and (kind in _WHOLE or (kind == "bag" and _is_one(folder, files))):
             yield Found(folder, kind)
-        else:
+        elif kind not in _WHOLE:
             yield from (Found(file, kind) for file in files)
-        return
 
 
 def _is_one(folder: Path, files: list[Path]) -> bool:
