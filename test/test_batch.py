@@ -17,8 +17,19 @@ import psutil
 import pytest
 from command import environment, fails, ofsat, succeeds
 
-from ofsat_ros.batch import Found, Order, Place, Settings, content_key, find_recordings, tasks
+from ofsat_ros.batch import (
+    Found,
+    Order,
+    Outcome,
+    Place,
+    Settings,
+    content_key,
+    find_recordings,
+    tasks,
+)
 from ofsat_ros.batch.content import stamp
+from ofsat_ros.catalog import Catalog, CatalogError
+from ofsat_ros.cli.batch import _Screen as Screen
 from ofsat_ros.recordings import BagWriter, RecordingError
 from ofsat_ros.simulation import scenario
 
@@ -112,6 +123,9 @@ def test_recordings_are_found_in_all_folders(tmp_path):
     (sky,) = (each for each in found if each.kind == "FITS")
     assert [file.name for file in sky.files] == ["a.fits", "b.fits"]
     assert find_recordings([bag], besides=tmp_path)[0].name == "bag"
+    # Workers may be in another folder.
+    relative = Path(os.path.relpath(bag / "bag.mcap"))
+    assert find_recordings([relative], besides=tmp_path)[0].path.is_absolute()
     with pytest.raises(RecordingError, match=r"nowhere does not exist: check the path"):
         find_recordings([tmp_path / "nowhere"], besides=tmp_path / "out")
 
@@ -178,6 +192,7 @@ def start(tmp_path: Path, *arguments: object) -> subprocess.Popen:
         stderr=subprocess.PIPE,
         text=True,
         cwd=tmp_path,
+        start_new_session=True,  # as a terminal has it
         env=environment() | {"DASK_DISTRIBUTED__WORKER__PRELOAD": f"{preload}"},
     )
 
@@ -193,7 +208,7 @@ def test_neither_bad_recordings_nor_dying_workers_stop_the_rest(tmp_path):
     batch = start(tmp_path, night, "-o", out, "--workers", 2, "--no-report")
     summary, said = batch.communicate(timeout=PATIENCE_S)
     assert batch.returncode == 3, said
-    assert summary.startswith("5 of 5 recordings: 2 done, 1 skipped, being done already, 2 failed")
+    assert summary.startswith("5 of 5 recordings: 2 done, 1 skipped, done before, 2 failed")
     always, bad = sorted(said.splitlines()[-2:])
     assert always.startswith(f"failed: {night}/always: its worker died 3 times")
     assert bad == f"failed: {night}/bad.ser is no SER file, or cut within its header"
@@ -219,13 +234,10 @@ def test_a_batch_that_is_ended_goes_on_where_it_was(tmp_path):
     words = ("night", "-o", out, "--workers", 2, "--segment-frames", SEGMENT, *SHORT)
     batch = start(tmp_path, *words)
     wait_for(lambda: list(out.glob("unfinished/*")), batch)
-    batch.send_signal(signal.SIGINT)
+    os.killpg(batch.pid, signal.SIGINT)  # Ctrl-C, which the workers hear, too
     summary, said = batch.communicate(timeout=PATIENCE_S)
     assert (batch.returncode, summary) == (130, "")
-    assert said.endswith(
-        "stopped; 0 of 1 recordings: 0 done; run the same command again to go on\n"
-    )
-    assert "Traceback" not in said
+    assert said == "stopped; 0 of 1 recordings: 0 done; run the same command again to go on\n"
     assert json.loads((out / "batch.json").read_text())["stopped"]
 
     batch = start(tmp_path, *words)
@@ -251,6 +263,27 @@ def test_a_batch_that_is_ended_goes_on_where_it_was(tmp_path):
     succeeds("process", tmp_path / "night" / "long", "-o", tmp_path / "whole", *SHORT)
     for name in ("detections.csv", "tracks.csv", "star_field.csv"):
         assert rows(found, name) == rows(tmp_path / "whole", name)
+
+
+def test_work_goes_on_while_the_catalogue_is_locked(tmp_path, monkeypatch, capsys):
+    asked = []
+
+    def add(folder):
+        asked.append(folder)
+        if len(asked) == 1:
+            raise CatalogError("is being written by another process")
+
+    with Catalog(tmp_path, write=True) as catalog:
+        monkeypatch.setattr(catalog, "add", add)
+        with Screen(catalog, tmp_path, 2, report=True) as screen:
+            screen.finished(Outcome("one", "done", folder="results/one"))
+            screen.finished(Outcome("two", "skipped", folder="results/two"))
+            assert f"{screen}" == "2 of 2 recordings: 1 done, 1 skipped, done before"
+            screen.catch_up()
+    assert [folder.name for folder in asked] == ["one", "two", "one"]
+    # Neither has a page, which was asked for.
+    said = capsys.readouterr().err
+    assert f"note: {tmp_path}/results/two was done before, without a page: `ofsat report" in said
 
 
 def wait_for(condition, batch: subprocess.Popen) -> None:
@@ -297,7 +330,7 @@ def test_work_is_done_once_on_a_cluster_of_others(tmp_path, scheduler, monkeypat
     write_bag(night / "second", seed=2)
     done = succeeds(*words)
     assert done.stdout.startswith(
-        "2 of 2 recordings: 1 done, 1 skipped, being done already; results, catalog.sqlite,"
+        "2 of 2 recordings: 1 done, 1 skipped, done before; results, catalog.sqlite,"
         f" report.html, nights and batch.json are in {out}"
     )
     assert told(out)["moved"]["folder"] == f"results/{first.parent.name}"

@@ -79,7 +79,7 @@ def test_a_night_says_what_was_found(made: Path):
     assert "In 20 % of the frames no motion of stars was found: clouds, or too few stars" in words
     assert "dusk 1.bag : a gap of 5 s" in words
     assert (
-        "dawn.bag : The run was stopped before the recording's end. 3 frames could not be"
+        "dawn.bag : The run was stopped before the recording's end. · 3 frames could not be"
         " processed." in words
     )
     assert "1 of 3 tracks have no right ascension and declination: no attitude." in words

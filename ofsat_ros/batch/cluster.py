@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing import resource_tracker
 from typing import Any, Self
 
 from ofsat_ros.batch.tasks import PROGRESS, Answer, Order, probe
@@ -241,6 +242,8 @@ def _signals_for_us() -> Iterator[None]:
     if sys.platform == "win32":
         yield
         return
+    # Who begins this process of Python's own lets the thread hear SIGINT again.
+    resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
     try:
         yield
@@ -251,6 +254,8 @@ def _signals_for_us() -> Iterator[None]:
 @contextmanager
 def _client(distributed: Any, cluster: Any, name: str) -> Iterator[Any]:
     """Connect with a cluster, or with what has this address."""
+    # What goes wrong with it is told in our words.
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     try:
         client = distributed.Client(cluster, timeout=_CONNECT_S)
     except (OSError, ValueError) as error:

@@ -52,8 +52,6 @@ def describe(folder: Path) -> dict[str, Any]:
         raise ResultError(f"{folder} is not taken in: {RUN} tells of no frame and its time")
     if run.get("segment") is not None:
         raise ResultError(f"{folder} is not taken in: it is a part that ofsat batch will join")
-    if run.get("segment") is not None:
-        raise ResultError(f"{folder} is not taken in: it is a part that ofsat batch will join")
     if not recordings:
         raise ResultError(f"{folder / RUN} is damaged: no recording; run ofsat process again")
     same = ("key", "content", "topic", "version", "preset", "started_utc", "seconds", "frames")

@@ -115,11 +115,12 @@ def command(
                 raise RecordingError(f"there is no recording in {' '.join(map(str, places))}")
             order = Order(f"{output.resolve()}", place.run, 1, report)
             catalog = stack.enter_context(Catalog(output / CATALOG, write=True))
-            screen = stack.enter_context(_Screen(catalog, output, len(found)))
+            screen = stack.enter_context(_Screen(catalog, output, len(found), bool(report)))
             batch = Batch(place, found, settings, order, screen.finished)
             with Cluster(order, scheduler, workers) as cluster:
                 batch.run(cluster, screen.show)
             failed = [outcome for outcome in batch.outcomes if outcome.state == "failed"]
+            screen.catch_up()
             pages = _write_pages(catalog, output, failed)
     except (RecordingError, ClusterError, CatalogError, ModuleNotFoundError, OSError) as error:
         fail(error, f"; {screen}" if screen else "")
@@ -144,10 +145,14 @@ class _Screen:
     output : Path
     count : int
         Recordings in all.
+    report : bool
+        Whether each result is to have a page.
     """
 
-    def __init__(self, catalog: Catalog, output: Path, count: int) -> None:
+    def __init__(self, catalog: Catalog, output: Path, count: int, report: bool) -> None:
         self._catalog, self._output, self._count = catalog, output, count
+        self._report = report
+        self._late: list[Path] = []
         self._states: Counter[str] = Counter()
         self._bar: tqdm[Any] = tqdm(unit=" frames", dynamic_ncols=True, disable=None)
         self._begun_s = self._told_s = time.monotonic()
@@ -162,7 +167,7 @@ class _Screen:
         done, skipped, failed = (self._states[each] for each in ("done", "skipped", "failed"))
         words = f"{done + skipped + failed} of {self._count} recordings"
         parts = [f"{done} done"]
-        parts += [f"{skipped} skipped, being done already"] * bool(skipped)
+        parts += [f"{skipped} skipped, done before"] * bool(skipped)
         parts += [f"{failed} failed"] * bool(failed)
         return f"{words}: {', '.join(parts)}"
 
@@ -172,10 +177,24 @@ class _Screen:
         if outcome.state == "failed":
             say(_failure(outcome))
             return
+        folder = self._output / outcome.folder
+        if self._report and not (folder / REPORT).is_file():
+            say(f"note: {folder} was done before, without a page: `ofsat report {folder}`")
         try:
-            self._catalog.add(self._output / outcome.folder)
+            self._add(folder)
+        except CatalogError:
+            self._late.append(folder)  # somebody looks into the file: work goes on
+
+    def catch_up(self) -> None:
+        """Add what the catalogue could not take in at its time; raises CatalogError."""
+        for folder in self._late:
+            self._add(folder)
+
+    def _add(self, folder: Path) -> None:
+        try:
+            self._catalog.add(folder)
         except (ResultError, OSError) as error:
-            say(f"note: {CATALOG} is without {outcome.folder}: {in_words(error)}")
+            say(f"note: {CATALOG} is without {folder}: {in_words(error)}")
 
     def show(self, done: int, total: float) -> None:
         """Tell how many frames are done, and of how many."""
