@@ -221,7 +221,8 @@ def test_a_catalogue_moves_along_with_its_folders(out: Path):
 def test_results_that_are_gone_are_forgotten_on_demand(out: Path):
     shutil.rmtree(out / "results" / "first")
     with Catalog(out, write=True) as catalog:
-        assert catalog.remove_missing() == 1
+        assert catalog.remove_missing(out / "elsewhere") == 0
+        assert catalog.remove_missing(out / "results") == 1
         assert catalog.remove_missing() == 0
         (row,) = catalog.results()
         assert row.name == "Second.bag"

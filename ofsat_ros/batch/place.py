@@ -118,3 +118,5 @@ class Place:
         for left in (self.folder / UNFINISHED).glob("*"):
             with suppress(OSError), hold(left):
                 shutil.rmtree(left)
+        with suppress(OSError):  # there may be none, or one in which somebody is at work
+            (self.folder / UNFINISHED).rmdir()

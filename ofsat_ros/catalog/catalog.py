@@ -204,9 +204,20 @@ class Catalog:
             raise ResultError(f"{folder} is damaged: {error}; run ofsat process again") from error
         return True
 
-    def remove_missing(self) -> int:
-        """Forget results whose folders are gone, and return how many those were."""
-        gone = [one.id for one in self.results() if not one.folder.is_dir()]
+    def remove_missing(self, below: Path | None = None) -> int:
+        """Forget results whose folders are gone, and return how many those were.
+
+        Parameters
+        ----------
+        below : Path, optional
+            Only those of this folder: others may be on a disk that is not there now.
+        """
+        gone = [
+            one.id
+            for one in self.results()
+            if not one.folder.is_dir()
+            and (below is None or below.resolve() in one.folder.resolve().parents)
+        ]
         with self._file.change() as file:
             file.executemany("DELETE FROM results WHERE id = ?", [(one,) for one in gone])
         return len(gone)

@@ -217,7 +217,7 @@ def _failure(outcome: Outcome) -> str:
 
 def _write_pages(catalog: Catalog, output: Path, failed: list[Outcome]) -> list[str]:
     """Write the page of each night and that of the archive, and return what to name of them."""
-    catalog.remove_missing()
+    catalog.remove_missing(output / RESULTS)
     try:
         write_pages(catalog, output, {outcome.recording: outcome.reason for outcome in failed})
     except ModuleNotFoundError as error:
