@@ -1,6 +1,7 @@
 # Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
 """Processes of a night: killed, restarted, doubled, hung, told to end at the worst moment."""
 
+import ctypes
 import fcntl
 import os
 import re
@@ -63,6 +64,21 @@ def test_a_node_that_starts_ends_when_it_is_told_to(sign, number, tmp_path):
         assert node.wait() == 0, node.err
     assert "Traceback" not in node.out + node.err
     assert not segments & set(os.listdir(SHM))
+
+
+def test_a_signal_that_another_thread_gets_ends_a_node(tmp_path):
+    """As one that comes just before the main thread waits, it does not wake that."""
+    with Process(tmp_path, "detector") as node:
+        node.wait_for("waiting for images on")
+        pid, mask = node.popen.pid, 1 << (signal.SIGINT - 1)
+        others = [
+            int(task.name)
+            for task in Path(f"/proc/{pid}/task").iterdir()
+            if int(task.name) != pid
+            and not int(re.findall(r"SigBlk:\t(\w+)", (task / "status").read_text())[0], 16) & mask
+        ]
+        assert ctypes.CDLL(None).tgkill(pid, others[0], signal.SIGINT) == 0
+        assert node.wait() == 0, node.err
 
 
 def test_a_node_that_cannot_be_made_ends_when_it_is_told_to(tmp_path):

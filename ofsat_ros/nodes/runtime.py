@@ -40,6 +40,8 @@ from ofsat_ros.printing import printable
 STARTED_WRONGLY = 2  # exit code; the same as argparse's
 
 _PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+# How often the main thread looks whether a signal has come.
+_LOOK_S = 0.2
 # How long a node's own threads, or the middleware, may take to end, or a node to be made: signals
 # must end it within a second.
 _PATIENCE_S = 0.5
@@ -287,7 +289,10 @@ def _serve(node: Node, stop: threading.Event) -> NoReturn:
 
     thread = threading.Thread(target=spin, name="executor", daemon=True)
     thread.start()
-    stop.wait()
+    # Python acts on a signal when this thread goes on, and one that comes just before it waits, or
+    # to another thread, does not wake it.
+    while not stop.wait(_LOOK_S):
+        pass
     node.close()
     code = getattr(node, "exit_code", 0)
     # What follows is the middleware's: it is not waited for longer than is usual.
