@@ -13,7 +13,9 @@ import subprocess
 import sys
 import tempfile
 
-PYTHONS = ("3.11", "3.12", "3.13", "3.14")
+# pip goes by the Python that runs it where a package asks for another one only in some of them, as
+# rosbags does for one that 3.14 has itself: so not that.
+PYTHONS = ("3.11", "3.12", "3.13")
 # Debian 12, Ubuntu 24.04 and what is newer take both.
 PLATFORMS = ("manylinux2014_aarch64", "manylinux_2_28_aarch64")
 
