@@ -9,6 +9,7 @@ import pytest
 
 from ofsat_ros.detection import SPOT_DTYPE, refine
 from ofsat_ros.history import History, PastFrame
+from ofsat_ros.parameters import Parameters
 from ofsat_ros.pipeline import Pipeline
 from ofsat_ros.simulation import RSO, SimulatorSettings, SkySimulator
 
@@ -78,14 +79,26 @@ def spot_at(x: float, y: float) -> np.ndarray:
     return spots
 
 
-def streak(first: float, last: float, size: int = 96) -> np.ndarray:
-    """An even streak along x in the middle row, between two places, with noise."""
-    x = np.arange(size)
-    ends = [np.array([math.erf((v - end) / math.sqrt(2)) for v in x]) for end in (first, last)]
+def streak(
+    first: float,
+    last: float,
+    size: int = 96,
+    star: tuple[float, float] = (0.0, 0.0),
+    seed: int = 5,
+) -> np.ndarray:
+    """An even streak along x in the middle row, between two places, with noise.
+
+    In the same row, between two others, a star's trail is six times as bright.
+    """
     across = np.exp(-((np.arange(size) - size // 2) ** 2) / 2)
-    light = 400 * (ends[0] - ends[1]) / 2
-    noise = np.random.default_rng(5).normal(500, 10, (size, size))
-    return (across[:, None] * light + noise).astype(np.uint16)
+    image = np.random.default_rng(seed).normal(500, 10, (size, size))
+    for peak, (begin, end) in ((400, (first, last)), (2400, star)):
+        rise, fall = (
+            np.array([math.erf((v - edge) / math.sqrt(2)) for v in np.arange(size)])
+            for edge in (begin, end)
+        )
+        image += across[:, None] * peak * (rise - fall) / 2
+    return image.astype(np.uint16)
 
 
 @pytest.mark.parametrize("middle", [48.0, 48.3, 48.75])
@@ -120,3 +133,31 @@ def test_a_long_gap_costs_no_memory():
     tracemalloc.stop()
     assert peak < 50e6
     assert row["x"] == pytest.approx(48, abs=0.3)
+
+
+@pytest.mark.parametrize("length", [0.0, 6.0])
+def test_a_star_on_the_line_of_motion_is_not_the_streak(length):
+    """A field that moves by 40 px a frame: as far as that, stars lie on the line."""
+    _, frame = one_frame(streak(45, 51, star=(10, 16)))
+    spot = spot_at(48, 48)
+    spot["length"] = length
+    (row,) = refine(frame, [], spot, np.array([[40.0, 0.0]]), np.zeros((0, 1), bool))
+    # The slope of the ends, 160 DN a pixel, summed over 1.8 rows, in noise of 10 DN: 0.05 px.
+    assert row["x"] == pytest.approx(48, abs=0.15)
+    assert row["length"] == pytest.approx(6, abs=1)
+
+
+def test_a_star_beyond_an_rso_that_hardly_moves_is_subtracted():
+    """The other frames show the RSO itself, but also the star, and that it is one."""
+    pipeline = Pipeline(Parameters(history_frames=3))
+    for number in range(3):
+        # 1.5 px a frame away from a star that begins at its wings.
+        image = streak(45 + 1.5 * number, 51 + 1.5 * number, star=(32, 38), seed=number)
+        pipeline.process(image, number * 10**9)
+    history = pipeline._history
+    frame, others = history[2], [history[0], history[1]]
+    spot = spot_at(51, 48)
+    spot["length"] = 6.0
+    (row,) = refine(frame, others, spot, np.array([[40.0, 0.0]]), np.ones((2, 1), bool))
+    assert row["x"] == pytest.approx(51, abs=0.15)
+    assert row["length"] == pytest.approx(6, abs=1)

@@ -7,7 +7,7 @@ a frame with the history and leave it to ``tracking`` to tell RSOs from noise.
 
 from ofsat_ros.detection.appearance import BORDER_PX, SPOT_DTYPE, find_spots, spot_near
 from ofsat_ros.detection.drift import Drift, find_drifting
-from ofsat_ros.detection.refinement import refine
+from ofsat_ros.detection.refinement import WINGS_PX, refine
 from ofsat_ros.detection.two_frames import (
     CANDIDATE,
     CONFIRMED,
@@ -27,6 +27,7 @@ __all__ = [
     "MEASURED_FIELDS",
     "POINT_WIDTH_PX",
     "SPOT_DTYPE",
+    "WINGS_PX",
     "Drift",
     "detect",
     "find_drifting",

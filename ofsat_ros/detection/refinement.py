@@ -37,6 +37,8 @@ _STEPS = np.arange(-_WINDOW_PX, _WINDOW_PX + 1)
 # Places across a streak, px, and the pixels around a place between them.
 _ACROSS = np.arange(-_ACROSS_PX, _ACROSS_PX + 1.0)
 _CORNERS = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])
+# So far from a source, its wings are in the noise, px.
+WINGS_PX = 6.0
 # A centroid that moves by less stays, px.
 _STILL_PX = 0.01
 
@@ -82,7 +84,7 @@ def refine(
         _strip(spot, direction, reach)
         for spot, direction, reach in zip(spots[moving], directions, ways[moving], strict=True)
     ]
-    lights = _lights(frame, others, strips, hidden[:, moving])
+    lights = _lights(frame, others, spots[moving], strips, hidden[:, moving])
     for row, direction, light in zip(moving, directions, lights, strict=True):
         streak = _refined_streak(frame, spots[row], direction, ways[row], light)
         if streak is not None:
@@ -103,15 +105,22 @@ def _strip(spot: np.void, direction: Array, reach: float) -> Array:
 def _lights(
     frame: PastFrame,
     others: Sequence[PastFrame],
+    spots: NDArray[np.void],
     strips: Sequence[Array],
     hidden: NDArray[np.bool_],
 ) -> list[Array]:
-    """The light at points of S strips, given which of the others show each's source, (F, S)."""
+    """The light at points of S spots' strips, given which of the others show them, (F, S).
+
+    What is beyond a spot's wings is not itself in the others either.
+    """
     if not strips:
         return []
     points = np.concatenate([strip.reshape(-1, 2) for strip in strips])
     sizes = [strip.shape[0] * strip.shape[1] for strip in strips]
-    light = _light_between(frame, others, points, np.repeat(hidden, sizes, axis=1))
+    reach = np.repeat(spots["length"] / 2 + WINGS_PX, sizes)
+    near = _length(points - np.repeat(positions(spots), sizes, axis=0)) <= reach
+    itself = np.repeat(hidden, sizes, axis=1) & near
+    light = _light_between(frame, others, points, itself)
     parts = np.split(light, np.cumsum(sizes)[:-1])
     return [part.reshape(strip.shape[:2]) for part, strip in zip(parts, strips, strict=True)]
 
@@ -125,7 +134,8 @@ def _refined_streak(
     start = np.array([spot["x"], spot["y"]])
     weight = np.exp(-(across**2) / (2 * POINT_WIDTH_PX**2))
     profile = _profile(light, weight)
-    first, last = _segment(profile, reach, _noise_across(weight) * frame.noise)
+    near = float(spot["length"]) / 2 + _FARTHEST_PX
+    first, last = _segment(profile, reach, near, _noise_across(weight) * frame.noise)
     if last - first <= _LONGEST_POINT_PX:
         return None
     sideways = _centroid(np.nan_to_num(light[first:last]).sum(axis=0), across)
@@ -184,13 +194,17 @@ def _profile(light: Array, weight: Array) -> Array:
     return np.interp(rows, rows[sure], sums[sure])
 
 
-def _segment(profile: Array, reach: float, unit: float) -> tuple[int, int]:
+def _segment(profile: Array, reach: float, near: float, unit: float) -> tuple[int, int]:
     """First and last (not included) of the samples of a profile that stand out most together.
 
     Of smoothed light, the sum over a segment is the matched filter of a streak of its length.
-    `unit` is the profile's noise.
+    It is `reach` long at most, and as near to the profile's middle as told: a spot is a piece of
+    its streak, and what else shines on the line of its motion is a star; what is brighter than
+    the spot is, too, and counts as bright as that.  `unit` is the profile's noise.
     """
-    sums = np.concatenate([[0], np.cumsum(profile)])
+    spot = len(profile) // 2
+    own = profile[max(0, spot - int(near)) : spot + int(near) + 1]
+    sums = np.concatenate([[0], np.cumsum(np.minimum(profile, np.max(own)))])
     first, last = np.triu_indices(len(sums), 1)
     length = last - first
     # Variance of a sum of so many samples, whose correlation is exp(-r^2 / 4): each one more has
@@ -199,7 +213,8 @@ def _segment(profile: Array, reach: float, unit: float) -> tuple[int, int]:
     grows = 1 + 2 * np.concatenate([[0], np.cumsum(correlation)])
     variance = np.cumsum(grows)[length - 1]
     merit = (sums[last] - sums[first]) / np.sqrt(variance)
-    merit[length > reach + 1] = -np.inf
+    apart = (first > spot + near) | (last - 1 < spot - near)
+    merit[apart | (length > reach + 1)] = -np.inf
     best, short = int(np.argmax(merit)), length <= _LONGEST_POINT_PX
     gain = (merit[best] ** 2 - np.max(merit[short]) ** 2) / unit**2
     if gain < _STREAK_SIGMAS**2:

@@ -15,7 +15,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ofsat_ros.detection import BORDER_PX, CANDIDATE, CONFIRMED, DETECTION_DTYPE, SPOT_DTYPE, Drift
+from ofsat_ros.detection import (
+    BORDER_PX,
+    CANDIDATE,
+    CONFIRMED,
+    DETECTION_DTYPE,
+    SPOT_DTYPE,
+    WINGS_PX,
+    Drift,
+)
 from ofsat_ros.history import History, PastFrame
 from ofsat_ros.pixels import as_complex, positions
 from ofsat_ros.tracking.assignment import SLOW_PX, as_spots, assign
@@ -53,8 +61,6 @@ _FAINT_SIGMAS = 4.0
 _PULLED_PX = 1.0
 # A frame in which the track itself was as near as this doesn't show what is behind it, px.
 _SELF_PX = 2.5
-# Nor one in which its wings reach what is measured.
-_WINGS_PX = 6.0
 # What moved less than this in the sensor may be a defect, px; for each known one so many are not.
 _STILL_PX, _UNKNOWN_DEFECTS = 3.0, 0.1
 # Logarithm of how much less sure a candidate may be than a confirmed track.
@@ -262,7 +268,7 @@ class Tracker:
         slow = np.hypot(motions[:, 0], motions[:, 1]) < SLOW_PX
         long = np.array([track.length for track in tracks]) > _LONGEST_POINT_PX
         rows = np.flatnonzero(~(slow & long))
-        hidden = _hidden(tracks, frame, history, _WINGS_PX)[:, rows]
+        hidden = _hidden(tracks, frame, history, WINGS_PX)[:, rows]
         spots = spots.copy()
         spots[rows] = self._refine(
             frame, history.others(frame), spots[rows], motions[rows], hidden
