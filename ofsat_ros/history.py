@@ -60,6 +60,8 @@ class PastFrame:
         Flat indices, ascending, of the pixels that spots may be made of.
     blind : (H, W) bool or None
         Pixels that show no sky; None if all do.
+    scatter : float
+        How many times as much as stated its stars scatter about the motion that gave it its place.
     """
 
     number: int
@@ -72,6 +74,7 @@ class PastFrame:
     to_sky: Array
     bright: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
     blind: NDArray[np.bool_] | None = None
+    scatter: float = 1.0
     from_sky: Array = field(init=False)
 
     def __post_init__(self) -> None:

@@ -330,6 +330,7 @@ class Pipeline:
                 bright=bright,
                 blind=pre.blind,
                 to_sky=to_sky,
+                scatter=1.0 if motion is None else motion.residual_sigmas,
             )
         )
 

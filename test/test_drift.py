@@ -2,6 +2,7 @@
 """Drift: what leaves its place on the sky slowly, and stars, which do not."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -233,3 +234,22 @@ def test_frames_without_objects_show_no_drift():
     light = blobs(SHAPE, PLACES, flux(40, (0, 0)), 1.0)
     history.add(past(camera(light, rng), 4))
     assert find_drifting(history, LOG_LIMIT) == []
+
+
+def smeared(history: History) -> History:
+    """The same, but for the stars of the last frame but two, which scatter six times as much."""
+    copy = History(FRAMES + 1)
+    for frame in history:
+        copy.add(replace(frame, scatter=6.0 if frame.number == FRAMES - 3 else 1.0))
+    return copy
+
+
+def test_centroids_that_scatter_as_the_stars_of_their_frame_show_no_drift():
+    """A slew within the exposure smears bright and faint stars unevenly; one frame is enough."""
+    history, objects = history_of(np.random.default_rng(31), FIELDS[1], (0.25, 0.1))
+    assert_found(history, objects)
+    assert find_drifting(smeared(history), LOG_LIMIT) == []
+    # It does not count against what was not seen in that frame.
+    others = [number for number in range(FRAMES) if number != FRAMES - 3]
+    history, objects = history_of(np.random.default_rng(31), FIELDS[1], (0.25, 0.1), seen=others)
+    assert_found(smeared(history), objects, others)

@@ -124,6 +124,9 @@ def find_drifting(history: History, log_limit: float, known: Collection[int] = (
     found = rows >= 0
     lines = _Lines(times, places, found)
     error = np.sqrt(variance.sum(axis=1) / lines.count + _CENTROID_FLOOR_PX**2)
+    # Where a slew within the exposure smears stars unevenly, bright and faint ones part.
+    scatter = np.array([other.scatter for other in (frame, *earlier)])
+    scale = np.maximum(scale, np.max(np.where(found, scatter, 1.0), axis=1))
     speed = np.abs(lines.velocity)
     significance = speed * np.sqrt(lines.spread) / error / scale
     log_false = np.log(len(frame.objects)) - significance**2 / 2
