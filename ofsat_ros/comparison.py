@@ -7,7 +7,7 @@ flow to where the field went and asks whether what it found is the field's motio
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,8 @@ class Seen:
         Its objects.
     flow_input : FlowInput
         The same for the flow engines.
+    strays : (K,) intp
+        Rows of objects that surely do not move with the stars.
     """
 
     stamp_ns: int
@@ -56,6 +58,7 @@ class Seen:
     parameters: Parameters
     objects: NDArray[np.void]
     flow_input: FlowInput
+    strays: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
 
     @property
     def all(self) -> NDArray[np.bool_]:
@@ -77,6 +80,15 @@ class Seen:
             return int(self.clear.sum())
         far = ~is_near(self.flow_input.xy, known, self.objects["length"])
         return int(np.count_nonzero(self.clear & far))
+
+    def leads_astray(self, flow: Flow) -> NDArray[np.bool_]:
+        """Which vectors of a flow from this frame come from one of its strays, (N,)."""
+        stray = np.zeros(len(flow), bool)
+        if len(self.strays):
+            start = flow.position - flow.displacement
+            rows = np.flatnonzero(flow.valid & self.flow_input.contains(start))
+            stray[rows] = np.isin(self.flow_input.object_at(start[rows]), self.strays)
+        return stray
 
     def shows_as_much_as(self, other: Seen | None) -> bool:
         """Whether it has no fewer clear objects than another frame."""
@@ -153,7 +165,7 @@ def find_motion(
     believed : bool
         Whether it is more than chance shows.
     """
-    valid = flow.valid
+    valid = flow.valid & ~before.leads_astray(flow)
     motion = estimate_motion(
         flow.position[valid],
         flow.displacement[valid],

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -229,6 +229,11 @@ class History:
     def others(self, frame: PastFrame) -> list[PastFrame]:
         """All frames but this one, oldest first."""
         return [other for other in self._frames if other is not frame]
+
+    def straighten(self, to_sky: Sequence[Array]) -> None:
+        """Give all frames other places on the sky: matrices (3, 3) as `PastFrame.to_sky`."""
+        for index, matrix in enumerate(to_sky):
+            self._frames[index] = replace(self._frames[index], to_sky=matrix)
 
     def place(self, motion: StarFieldMotion | None, since: Array | None = None) -> Array:
         """Matrix from px of a new frame to the sky plane, (3, 3).

@@ -10,11 +10,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ofsat_ros.comoving import find_comoving
 from ofsat_ros.comparison import (
     Seen,
     find_motion,
@@ -231,7 +233,8 @@ class Pipeline:
         self._guessing = blind and (self._field_rate is not None or current.shows_stars(known))
         if parameters.rso_test == "history":
             self._remember(pre, current.flow_input.regions, result, parameters)
-            self._track(pre.defects, result, parameters)
+            current, drifts = self._straighten(current, result)
+            self._track(pre.defects, drifts, result, parameters)
         else:
             self._forget()
             self._settled.append(Settled(result.frame, stamp_ns, result.detections))
@@ -334,8 +337,33 @@ class Pipeline:
             )
         )
 
-    def _track(self, defects: int, result: FrameResult, parameters: Parameters) -> None:
-        """Fill in detections and tracks from the history."""
+    def _straighten(self, current: Seen, result: FrameResult) -> tuple[Seen, list[Drift]]:
+        """Tell what is no star where there are few, and put right what was taken for one."""
+        before = self._previous
+        if before is None or result.star_field is None:
+            return current, []
+        comoving = find_comoving(self._history, *self._tracker.rates())
+        if comoving is None:
+            # What was no star does not become one because stars are hidden.
+            strays = np.unique(result.flow.object_index[before.leads_astray(result.flow)])
+            return replace(current, strays=strays[strays >= 0]), []
+        if comoving.to_sky is not None:
+            history, motion, flow = self._history, result.star_field, result.flow
+            history.straighten(comoving.to_sky)
+            stars = positions(result.objects)[comoving.stars]
+            self._tracker.straighten(history, stars, comoving.tracks)
+            for frame in history:
+                if frame.stamp_ns == before.stamp_ns:
+                    motion = motion.led_by(frame.from_sky @ history[-1].to_sky)
+            inliers = flow.valid & np.isin(flow.object_index, comoving.stars)
+            result.star_field = motion.with_inliers(inliers) if inliers.any() else motion
+            self._field_rate = motion.over(1 / result.dt_s)
+        return replace(current, strays=comoving.strays), comoving.drifts
+
+    def _track(
+        self, defects: int, drifts: list[Drift], result: FrameResult, parameters: Parameters
+    ) -> None:
+        """Fill in detections and tracks from the history, and from what is known to drift."""
         history = self._history
         if len(history) < 2:
             return
@@ -351,7 +379,7 @@ class Pipeline:
             tracked = self._tracker.update(
                 history,
                 spots,
-                _nothing_new if self._guessing else partial(find_drifting, history, log_limit),
+                lambda known: drifts or self._find_drifting(known, log_limit),
                 defects,
                 log_limit,
                 parameters.max_speed_px,
@@ -361,10 +389,9 @@ class Pipeline:
         self._tracks = tracked.tracks, result.stamp_ns
         self._settled += tracked.settled
 
-
-def _nothing_new(_: NDArray[np.intp]) -> list[Drift]:
-    """Find no drifts: among stars whose place is a guess, all drift."""
-    return []
+    def _find_drifting(self, known: NDArray[np.intp], log_limit: float) -> list[Drift]:
+        """Find what drifts; nothing among stars whose place is a guess, of which all drift."""
+        return [] if self._guessing else find_drifting(self._history, log_limit, known)
 
 
 def _check(image: NDArray[np.generic]) -> None:

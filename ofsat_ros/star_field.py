@@ -94,6 +94,17 @@ class StarFieldMotion:
         """Return the same motion with the inliers of another, longer, set of vectors."""
         return replace(self, inliers=inliers)
 
+    def led_by(self, matrix: Array) -> StarFieldMotion:
+        """Return the same, moving as a matrix (3, 3) from current to previous px says."""
+        turn = np.eye(2) - matrix[:2, :2]
+        displacement = turn @ self.centre - matrix[:2, 2]
+        return replace(
+            self,
+            displacement=displacement,
+            scale=float(turn[0, 0]),
+            rotation=float(turn[1, 0]),
+        )
+
     def over(self, times: float) -> StarFieldMotion:
         """Return the motion that goes on evenly for so many times as long."""
         return replace(

@@ -151,13 +151,13 @@ def test_objects_that_tracks_have_are_not_looked_at():
 @pytest.mark.parametrize("speed", [0.2, 0.6])
 def test_stars_that_stand_still_are_not_followed(monkeypatch, speed):
     history, objects = history_of(np.random.default_rng(16), FIELDS[0], (speed, 0.0), 40)
-    followed, follow = [], drift_module._follow
+    followed, follow = [], drift_module.follow
 
-    def recorded(frame, earlier, times, rows):
+    def recorded(frame, earlier, rows):
         followed.extend(rows)
-        return follow(frame, earlier, times, rows)
+        return follow(frame, earlier, rows)
 
-    monkeypatch.setattr(drift_module, "_follow", recorded)
+    monkeypatch.setattr(drift_module, "follow", recorded)
     found = {drift.rows[FRAMES - 1] for drift in assert_found(history, objects)}
     assert found <= set(followed)
     # beside the two: what is at the border, or was not seen in the two oldest frames

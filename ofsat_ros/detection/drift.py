@@ -16,24 +16,27 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from ofsat_ros.following import (
+    CENTROID_FLOOR_PX,
+    LEAST_FRAMES,
+    alike,
+    as_points,
+    centroid_variance,
+    follow,
+)
 from ofsat_ros.history import History, PastFrame
-from ofsat_ros.pixels import as_complex, interpolate, positions
+from ofsat_ros.pixels import interpolate, positions
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# An object is sought this near to its place in the frame before, px of the sky plane.
-_REACH_PX = 3.0
-# Its flux may differ by this factor.
-_FLUX_RATIO = 2.5
-_LEAST_FRAMES = 3
-# Frames in which it may have been missed, and how many must have it for each of those.
-_MOST_MISSES, _HITS_PER_MISS = 3, 2
-# What centroids scatter by beyond their stated std: blends, pixel phase, px.
-_CENTROID_FLOOR_PX = 0.02
+# How many frames must have it for each in which it was missed.
+_HITS_PER_MISS = 2
 # Registration and shape may move what Lucas-Kanade measures by this much, px.
 _FLOW_FLOOR_PX = 0.1
 _LEAST_DRIFT_PX = 0.8
+# Stars scatter by up to so many times as much as stated because they are few.
+_LEAST_SCATTER = 1.5
 # What was seen within so many sigmas of its place, or half the least drift, stands still.
 _STILL_SIGMAS = 3.0
 _FLOW_SIGMAS = 5.5
@@ -66,36 +69,6 @@ class Drift:
     log_false: float
 
 
-class _Lines:
-    """Straight lines of constant speed through the paths of objects.
-
-    Parameters
-    ----------
-    times : (K,) float64
-        Of the frames, s.
-    places : (N, K) complex128
-        Places of the objects in the sky plane, x + iy px; 0 where they were not found.
-    found : (N, K) bool
-        Where they were; at least once each.
-    """
-
-    def __init__(self, times: Array, places: NDArray[np.complex128], found: Mask) -> None:
-        self.count = found.sum(axis=1)
-        self._time = found @ times / self.count
-        self._place = places.sum(axis=1) / self.count
-        since = np.where(found, times - self._time[:, None], 0)
-        # sum of the squared times from their mean, s^2
-        self.spread = np.einsum("nk,nk->n", since, since)
-        slope = np.einsum("nk,nk->n", since, places) / np.maximum(self.spread, 1e-12)
-        self.long_enough = self.count >= _LEAST_FRAMES
-        # px/s; 0 where they have no time to move
-        self.velocity = np.where(self.long_enough, slope, 0)
-
-    def at(self, t: float) -> NDArray[np.complex128]:
-        """Points of the lines, (N,)."""
-        return self._place + self.velocity * (t - self._time)
-
-
 def find_drifting(history: History, log_limit: float, known: Collection[int] = ()) -> list[Drift]:
     """Find objects of the newest frame that drift against the stars.
 
@@ -114,18 +87,17 @@ def find_drifting(history: History, log_limit: float, known: Collection[int] = (
     """
     frame = history[-1]
     earlier = list(history)[-2::-1]
-    if len(earlier) < _LEAST_FRAMES - 1 or not len(frame.objects):
+    if len(earlier) < LEAST_FRAMES - 1 or not len(frame.objects):
         return []
     still, scale = _stand_still(frame, earlier)
     still[list(known)] = True
     followed = np.flatnonzero(~still)
-    times = np.array([other.seconds_since(frame) for other in (frame, *earlier)])
-    rows, places, variance = _follow(frame, earlier, times, followed)
-    found = rows >= 0
-    lines = _Lines(times, places, found)
-    error = np.sqrt(variance.sum(axis=1) / lines.count + _CENTROID_FLOOR_PX**2)
+    paths = follow(frame, earlier, followed)
+    times, rows, places, found = paths.times, paths.rows, paths.places, paths.found
+    lines, error = paths.lines, paths.error
     # Where a slew within the exposure smears stars unevenly, bright and faint ones part.
     scatter = np.array([other.scatter for other in (frame, *earlier)])
+    scatter[scatter < _LEAST_SCATTER] = 1.0
     scale = np.maximum(scale, np.max(np.where(found, scatter, 1.0), axis=1))
     speed = np.abs(lines.velocity)
     significance = speed * np.sqrt(lines.spread) / error / scale
@@ -147,7 +119,7 @@ def find_drifting(history: History, log_limit: float, known: Collection[int] = (
     chosen = chosen[misfit < _misfit_of_step(places[chosen], found[chosen])]
     if not chosen.size:
         return []
-    velocity = _points(lines.velocity[chosen])
+    velocity = as_points(lines.velocity[chosen])
     agrees = _flow_agrees(frame, earlier, followed[chosen], found[chosen, 1:], velocity)
     numbers = [other.number for other in (frame, *earlier)]
     return [
@@ -183,15 +155,15 @@ def _stand_still(frame: PastFrame, earlier: list[PastFrame]) -> tuple[NDArray[np
         are stars, what they scatter by beyond their stds is an error of scale.
     """
     objects = frame.objects
-    variance = _variance(objects) + _CENTROID_FLOOR_PX**2
+    variance = centroid_variance(objects) + CENTROID_FLOOR_PX**2
     reach = np.maximum(_LEAST_DRIFT_PX / 2, _STILL_SIGMAS * np.sqrt(variance))
     rest = np.flatnonzero(~objects["edge"])
     rows, distance = _at_places(earlier[-1], frame.object_sky[rest], objects["flux"][rest])
     seen = rows >= 0
     scale = 1.0
     if seen.any():
-        both = variance[rest[seen]] + _variance(earlier[-1].objects[rows[seen]])
-        sigmas = distance[seen] / np.sqrt(both + _CENTROID_FLOOR_PX**2)
+        both = variance[rest[seen]] + centroid_variance(earlier[-1].objects[rows[seen]])
+        sigmas = distance[seen] / np.sqrt(both + CENTROID_FLOOR_PX**2)
         # the median of the distance of two axes' noise
         scale = max(scale, float(np.median(sigmas)) / 1.18)
     rest = rest[distance >= reach[rest]]
@@ -211,54 +183,12 @@ def _at_places(other: PastFrame, sky: Array, flux: Array) -> tuple[NDArray[np.in
     x, y = np.rint(xy[inside]).astype(np.intp).T
     row = other.regions.at(y, x)
     inside, row = inside[row >= 0], row[row >= 0]
-    alike = _alike(other, row, flux[inside])
-    inside, row = inside[alike], row[alike]
+    same = alike(other, row, flux[inside])
+    inside, row = inside[same], row[same]
     rows, distance = np.full(len(sky), -1), np.full(len(sky), np.inf)
     rows[inside] = row
     distance[inside] = np.hypot(*(other.object_sky[row] - sky[inside]).T)
     return rows, distance
-
-
-def _nearest(other: PastFrame, sky: Array, flux: Array) -> NDArray[np.intp]:
-    """Rows of a frame's objects that are nearest to points, in reach and alike, else -1, (N,)."""
-    if not (len(sky) and len(other.objects)):
-        return np.full(len(sky), -1)
-    distance, row = other.object_tree.query(sky)
-    return np.where((distance < _REACH_PX) & _alike(other, row, flux), row, -1)
-
-
-def _alike(other: PastFrame, row: NDArray[np.intp], flux: Array) -> NDArray[np.bool_]:
-    """Whether objects of a frame are as bright as told, (N,), and whole."""
-    ratio = other.objects["flux"][row] / np.maximum(flux, 1e-9)
-    return (ratio < _FLUX_RATIO) & (ratio > 1 / _FLUX_RATIO) & ~other.objects["edge"][row]
-
-
-def _follow(
-    frame: PastFrame, earlier: list[PastFrame], times: Array, followed: NDArray[np.intp]
-) -> tuple[NDArray[np.intp], NDArray[np.complex128], Array]:
-    """Follow objects back through the frames.
-
-    Returns the row of each in each frame, the newest first (-1: not found), its place in the sky
-    plane, x + iy, and the variance of the centroid, 0 where it was not found; (N, K).
-    """
-    objects = frame.objects[followed]
-    shape = len(followed), len(times)
-    rows, places = np.full(shape, -1, np.intp), np.zeros(shape, np.complex128)
-    variance = np.zeros(shape)
-    last = as_complex(frame.object_sky[followed])
-    rows[:, 0], places[:, 0], variance[:, 0] = followed, last, _variance(objects)
-    misses = np.where(objects["edge"], _MOST_MISSES + 1, 0)
-    for column, other in enumerate(earlier, start=1):
-        before = np.s_[:, :column]
-        lines = _Lines(times[:column], places[before], rows[before] >= 0)
-        expected = np.where(lines.long_enough, lines.at(times[column]), last)
-        there = _nearest(other, _points(expected), objects["flux"])
-        near = np.flatnonzero((there >= 0) & (misses <= _MOST_MISSES))
-        there = there[near]
-        rows[near, column], variance[near, column] = there, _variance(other.objects[there])
-        last[near] = places[near, column] = as_complex(other.object_sky[there])
-        misses += rows[:, column] < 0
-    return rows, places, variance
 
 
 def _flow_agrees(
@@ -370,12 +300,3 @@ def _patches(frame: PastFrame, points: Array) -> Array:
     x, y = points.reshape(-1, points.shape[2], 2).astype(np.float32).transpose(2, 0, 1)
     values = interpolate(frame.smoothed, x.ravel(), y.ravel(), cv2.INTER_CUBIC)
     return values.astype(np.float64).reshape(points.shape[:3])
-
-
-def _variance(objects: NDArray[np.void]) -> Array:
-    """Of a centroid along one axis, px^2."""
-    return (objects["sigma_x"] ** 2 + objects["sigma_y"] ** 2) / 2
-
-
-def _points(places: NDArray[np.complex128]) -> Array:
-    return np.stack([places.real, places.imag], axis=1)

@@ -229,6 +229,12 @@ class Sighting:
                 telling[row[distance < _REPEATED_PX]] = False
         return cls(frame, spots, sky, np.ones(len(spots), bool), telling)
 
+    def seen_in(self, frame: PastFrame, before: Sighting | None) -> Sighting:
+        """Return the same with its frame at another place on the sky."""
+        other = Sighting.of(frame, self.spots, before)
+        other.free[:] = self.free
+        return other
+
     @cached_property
     def places(self) -> Places:
         """`sky` as complex numbers, (N,)."""

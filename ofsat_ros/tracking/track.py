@@ -7,7 +7,7 @@ The filter works on all tracks at once: a matrix of one track costs as much as t
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from operator import mul
@@ -158,6 +158,16 @@ class Track:
         for hit in hits[1:]:
             _update([self], [hit])
 
+    def see_in(self, frames: Mapping[int, PastFrame]) -> None:
+        """Take its hits to where frames of their numbers are now, and filter them again."""
+        known = {n: Hit.of(frames[n], hit.spot) for n, hit in self.hits.items() if n in frames}
+        if not known:
+            return
+        count, born = self.hit_count, (self.born_hits, self.born_ns)
+        self.hits = known
+        self.fit()
+        self.hit_count, (self.born_hits, self.born_ns) = count, born
+
     def go_on_from(self, before: Track) -> None:
         """Be the same RSO as a track that has ended; where both have a hit, its own counts."""
         self.track_id, self.born_ns = before.track_id, before.born_ns
@@ -174,10 +184,10 @@ class Track:
         near = sorted(self.hits.values(), key=lambda hit: abs(hit.number - number))[:_FIT_HITS]
         return self._line(near)[0]
 
-    def stands_still(self) -> bool:
+    def stands_still(self, least_hits: int = _WAY_HITS) -> bool:
         """Whether its last hits show no motion on the sky, so that it is a star after all."""
         last = [self.hits[number] for number in sorted(self.hits)[-2 * _WAY_HITS :]]
-        if len(last) < _WAY_HITS:
+        if len(last) < least_hits:
             return False
         velocity, error = self._line(last)
         span = (last[-1].stamp_ns - last[0].stamp_ns) / 1e9

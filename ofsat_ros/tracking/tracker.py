@@ -61,6 +61,8 @@ _FAINT_SIGMAS = 4.0
 _PULLED_PX = 1.0
 # A frame in which the track itself was as near as this doesn't show what is behind it, px.
 _SELF_PX = 2.5
+# Of what is beside a star, so many hits tell whether it moves; of others, how.
+_LEAST_HITS, _RATE_HITS = 2, 4
 # What moved less than this in the sensor may be a defect, px; for each known one so many are not.
 _STILL_PX, _UNKNOWN_DEFECTS = 3.0, 0.1
 # Logarithm of how much less sure a candidate may be than a confirmed track.
@@ -115,6 +117,46 @@ class Tracker:
         finally:
             self._tracks, self._ended, self._sightings = [], [], []
         return self._last_word.said()
+
+    def rates(self) -> tuple[Array, Array]:
+        """Velocities (N, 2) in the sky plane of tracks seen for a while, px/s, and stds (N,)."""
+        tracks = self._seen_for_a_while()
+        rates = np.array([track.state[2:] for track in tracks]).reshape(-1, 2)
+        traces = [np.trace(track.covariance[2:, 2:]) for track in tracks]
+        return rates, np.sqrt(np.array(traces) / 2)
+
+    def _seen_for_a_while(self) -> list[Track]:
+        return [track for track in self._tracks if len(track.hits) >= _RATE_HITS]
+
+    def straighten(
+        self, history: History, stars: Array, followed: Sequence[int] | NDArray[np.intp]
+    ) -> None:
+        """Take the new places of a history's frames, whose newest one has no sightings yet.
+
+        Tracks that are stars are withdrawn: those that stand still on the new sky, sooner if they
+        are at the places `stars`, (N, 2) px in the newest frame, and those of the rows `followed`
+        of `rates`.
+        """
+        known = self._seen_for_a_while()
+        gone = {known[row].track_id for row in followed}
+        frames = {frame.number: frame for frame in history}
+        for track in (*self._tracks, *self._ended):
+            track.see_in(frames)
+        sightings, self._sightings = self._sightings, []
+        for sighting in sightings:
+            if (frame := frames.get(sighting.frame.number)) is not None:
+                before = self._sightings[-1] if self._sightings else None
+                self._sightings.append(sighting.seen_in(frame, before))
+        at = places(self._tracks, history[-1])
+        for track, place in zip(self._tracks, at, strict=True):
+            is_near = np.any(np.hypot(*(stars - place).T) < _PIECE_PX)
+            if track.stands_still(_LEAST_HITS) if is_near else track.stands_still():
+                gone.add(track.track_id)
+        gone |= {track.track_id for track in self._ended if track.stands_still()}
+        for track_id in gone:
+            self._last_word.withdraw(track_id)
+        self._tracks = [track for track in self._tracks if track.track_id not in gone]
+        self._ended = [track for track in self._ended if track.track_id not in gone]
 
     def update(
         self,

@@ -1,0 +1,255 @@
+# Copyright 2026 ofsat_ros maintainers; SPDX-License-Identifier: Apache-2.0
+"""Few stars beside bright RSOs: those are the stars that move alike over several frames."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sky import frame_of
+
+from ofsat_ros.comoving import CoMoving, find_comoving
+from ofsat_ros.history import History
+from ofsat_ros.objects import OBJECT_DTYPE
+from ofsat_ros.pipeline import Pipeline
+from ofsat_ros.simulation import RSO, SimulatorSettings, SkySimulator
+
+FRAMES, SIDE = 9, 256
+MIDDLE = (SIDE - 1) / 2
+STARS = np.array([(60.0, 70.0), (180.0, 90.0), (120.0, 200.0), (40.0, 150.0)])
+SIGMA = 0.15
+NO_TRACKS = np.zeros((0, 2)), np.zeros(0)
+
+
+def history_of(
+    paths: list[np.ndarray],
+    wrong: tuple[float, float] = (0.0, 0.0),
+    seed: int = 1,
+    turn: float = 0.0,
+) -> History:
+    """Frames of objects with these paths, (FRAMES, 2) px each, and noise of SIGMA.
+
+    The frames' places on the sky follow a field that moves by (2, 1) px a frame and turns by
+    `turn` rad, but for what is `wrong`, px per frame.
+    """
+    rng, history = np.random.default_rng(seed), History(FRAMES)
+    for number in range(FRAMES):
+        objects = np.zeros(len(paths), OBJECT_DTYPE)
+        xy = np.array([path[number] for path in paths]).reshape(-1, 2)
+        xy += rng.normal(0, SIGMA, (len(paths), 2))
+        objects["x"], objects["y"] = xy.T
+        objects["sigma_x"] = objects["sigma_y"] = SIGMA
+        objects["flux"], objects["snr"] = 1000.0, 10.0
+        history.add(replace(frame_of(number, SIDE, sky_of(number, wrong, turn)), objects=objects))
+    return history
+
+
+def sky_of(number: int, wrong: tuple[float, float], turn: float) -> np.ndarray:
+    """Matrix from px to the sky plane of a field that turns about the image's middle."""
+    cos, sin = np.cos(-turn * number), np.sin(-turn * number)
+    matrix = np.eye(3)
+    matrix[:2, :2] = [[cos, -sin], [sin, cos]]
+    shift = np.add((2.0, 1.0), wrong) * number
+    matrix[:2, 2] = MIDDLE - matrix[:2, :2] @ (MIDDLE + shift)
+    return matrix
+
+
+def path(start: np.ndarray, drift: tuple[float, float] = (0, 0), turn: float = 0.0) -> np.ndarray:
+    """Where something is that moves by so much against the field, (FRAMES, 2) px."""
+    places = []
+    for number in range(FRAMES):
+        cos, sin = np.cos(turn * number), np.sin(turn * number)
+        off = np.array([[cos, -sin], [sin, cos]]) @ (start - MIDDLE)
+        places.append(MIDDLE + off + np.add((2.0, 1.0), drift) * number)
+    return np.array(places)
+
+
+def placed(history: History, found: CoMoving) -> np.ndarray:
+    """Places of the stars in the sky plane, (FRAMES, N, 2), where it says that the frames are."""
+    history.straighten(found.to_sky)
+    return np.array([frame.object_sky[found.stars] for frame in history])
+
+
+def test_what_the_field_was_taken_for_is_the_stray():
+    """The frames follow a bright RSO; three stars drift against it."""
+    drift = (0.5, -0.4)
+    paths = [*map(path, STARS[:3]), path(np.array([130.0, 120.0]), drift)]
+    history = history_of(paths, wrong=drift)
+    found = find_comoving(history, *NO_TRACKS)
+    assert found.stars.tolist() == [0, 1, 2]
+    assert found.strays.tolist() == [3]
+    sky = placed(history, found)
+    # The newest frame stays; in the others the mean of three stars is off by what its noise is.
+    assert history[-1].to_sky == pytest.approx(sky_of(FRAMES - 1, drift, 0))
+    off = (sky - sky[-1]).mean(axis=1)
+    assert np.abs(off).max() < 1e-6
+    assert np.abs(sky - sky.mean(axis=0)).max() < 5 * SIGMA
+
+
+def test_a_field_that_is_right_stays_where_it_is():
+    paths = [*map(path, STARS[:3]), path(np.array([130.0, 120.0]), (0.5, -0.4))]
+    found = find_comoving(history_of(paths), *NO_TRACKS)
+    assert (found.stars.tolist(), found.strays.tolist()) == ([0, 1, 2], [3])
+    assert found.to_sky is None
+
+
+@pytest.mark.parametrize("turn", [0.02, -0.008])
+def test_a_field_that_turns_is_one(turn):
+    paths = [path(start, turn=turn) for start in STARS]
+    found = find_comoving(history_of(paths, turn=turn), *NO_TRACKS)
+    assert found.stars.tolist() == [0, 1, 2, 3]
+    assert found.to_sky is None
+
+
+def test_a_turn_that_few_vectors_made_up_does_no_harm():
+    """The stars move alike in the image; on a sky that turns by 1 degree a frame they do not."""
+    paths = [*map(path, STARS), path(np.array([130.0, 120.0]), (0.5, -0.4))]
+    found = find_comoving(history := history_of(paths, turn=0.02), *NO_TRACKS)
+    assert (found.stars.tolist(), found.strays.tolist()) == ([0, 1, 2, 3], [4])
+    sky = placed(history, found)
+    assert np.abs(sky - sky.mean(axis=0)).max() < 5 * SIGMA
+
+
+def test_stars_that_shake_lead_nothing_astray():
+    """Long streaks end anywhere, but no object moves otherwise: the frames stay where they are."""
+    shaken = np.random.default_rng(4).normal(0, 1.0, (FRAMES, 2))
+    found = find_comoving(history_of([path(start) + shaken for start in STARS]), *NO_TRACKS)
+    assert found.stars.tolist() == [0, 1, 2, 3]
+    assert found.to_sky is None
+
+
+def test_a_star_that_was_missed_is_one():
+    paths = [*map(path, STARS[:3]), path(np.array([130.0, 120.0]), (0.5, -0.4))]
+    paths[1][[3, 6]] = (10.0, 10.0)
+    history = history_of(paths, wrong=(0.5, -0.4))
+    found = find_comoving(history, *NO_TRACKS)
+    assert (found.stars.tolist(), found.strays.tolist()) == ([0, 1, 2], [3])
+
+
+def test_what_can_not_be_told_is_not():
+    moving = [path(start, (0.4 * row, -0.3 * row)) for row, start in enumerate(STARS)]
+    assert find_comoving(history_of(moving), *NO_TRACKS) is None
+    two = [*moving, path(np.array([200.0, 200.0]), (-1.0, 1.0))]
+    two[1] = path(STARS[1])
+    assert find_comoving(history_of(two), *NO_TRACKS) is None
+    assert find_comoving(history_of(two[:4]), *NO_TRACKS).stars.tolist() == [0, 1]
+    assert find_comoving(history_of([]), *NO_TRACKS) is None
+    rng = np.random.default_rng(3)
+    many = [path(start) for start in rng.uniform(20, 200, (31, 2))]
+    assert find_comoving(history_of(many), *NO_TRACKS) is None
+    short = History(3)
+    for frame in list(history_of([*map(path, STARS)]))[:3]:
+        short.add(frame)
+    assert find_comoving(short, *NO_TRACKS) is None
+
+
+RATES = np.array([(2.2, 10.3), (2.3, 10.8), (2.25, 11.0), (-7.0, 1.0)])
+
+
+def test_tracks_that_move_alike_are_the_stars_where_no_objects_do():
+    """Rate tracking: two RSOs stand nearly still, and the stars are too faint for objects."""
+    paths = [path(np.array([130.0, 120.0])), path(np.array([90.0, 60.0]), (0.6, 0.8))]
+    history = history_of(paths)
+    errors = np.full(len(RATES), 0.1)
+    found = find_comoving(history, RATES, errors)
+    assert (found.stars.tolist(), found.strays.tolist()) == ([], [0, 1])
+    before = np.array([frame.to_sky for frame in history])
+    shift = (np.array(found.to_sky) - before)[:, :2, 2]
+    ages = np.arange(FRAMES) - (FRAMES - 1)
+    assert shift == pytest.approx(-ages[:, None] * RATES[:3].mean(axis=0), abs=1e-9)
+    assert found.tracks.tolist() == [0, 1, 2]
+    # What stood still drifts, in all frames, 11 px in each, known to 0.02 px.
+    rows = [dict.fromkeys(range(FRAMES), row) for row in (0, 1)]
+    assert [drift.rows for drift in found.drifts] == rows
+    assert all(drift.log_false < -1e4 for drift in found.drifts)
+
+
+def test_a_train_of_satellites_among_stars_is_not_the_stars():
+    found = find_comoving(history_of([*map(path, STARS[:2])]), RATES[:3], np.full(3, 0.1))
+    assert found.stars.tolist() == [0, 1]
+    assert found.to_sky is None
+
+
+@pytest.mark.parametrize("rows", [[0], [0, 3], [], [0, 1, 3, 3]])
+def test_tracks_that_are_too_few_or_no_majority_tell_nothing(rows):
+    rates = (
+        RATES[rows] * np.linspace(1, 1.3, len(rows))[:, None] if len(rows) == 4 else RATES[rows]
+    )
+    lone = history_of([path(np.array([130.0, 120.0]))])
+    assert find_comoving(lone, rates, np.full(len(rows), 0.1)) is None
+
+
+# In the pipeline
+
+
+def pass_of(settings: SimulatorSettings):
+    """Rows found and missed of the RSOs, false ones, and errors of the field's motion, px."""
+    pipeline, truth, settled, motions = Pipeline(), [], [], []
+    for frame in SkySimulator(settings):
+        result = pipeline.process(frame.image, frame.stamp_ns)
+        truth.append(frame.truth)
+        settled += result.settled
+        motions.append(result.star_field)
+    settled += pipeline.finish()
+    found, false = 0, 0
+    for last in settled:
+        true = truth[last.frame]
+        for row in last.detections:
+            off = np.hypot(true["x_px"] - row["x"], true["y_px"] - row["y"])
+            near = np.any(off < 3.5 + true["length_px"] / 2)
+            found, false = found + near, false + (not near)
+    field = -np.array(settings.camera_rate_arcsec_s) / settings.pixel_scale_arcsec
+    off = [np.hypot(*(motion.displacement - field)) for motion in motions[-5:] if motion]
+    return found, sum(map(len, truth)), false, off
+
+
+SPARSE = SimulatorSettings(
+    width=400,
+    height=400,
+    frames=20,
+    period_s=1.0,
+    pixel_scale_arcsec=5.0,
+    noise_mean_percent=5.0,
+    noise_std_percent=0.5,
+    star_count=18.0,
+    star_flux_percent=(2.0, 2000.0),
+    psf_sigma_px=1.0,
+)
+
+
+def test_a_bright_rso_that_drifts_among_few_stars_is_found_and_the_stars_are_not():
+    """It is brighter than all stars, and drifts by half a pixel a frame."""
+    settings = replace(
+        SPARSE,
+        camera_rate_arcsec_s=(-2.24, 1.63),
+        rsos=(RSO((181.0, 180.0), (1.2, 2.2), snr=45),),
+        seed=347009404,
+    )
+    found, of, false, off = pass_of(settings)
+    assert (found, false) == (of, 0)
+    # Stars of SNR 5 to 10, two to four of them: 0.2 px each, and what is alike in them.
+    assert np.median(off) < 0.5
+
+
+def test_stars_that_streak_past_two_rsos_that_are_followed_are_not_tracks():
+    """The mount follows one RSO, the other one drifts; four stars streak, none outshines them."""
+    settings = replace(
+        SPARSE,
+        width=256,
+        height=256,
+        frames=14,
+        exposure_s=0.9,
+        camera_rate_arcsec_s=(-12.7, -55.3),
+        rsos=(
+            RSO((144.2, 108.1), (-12.7, -55.3), snr=42),
+            RSO((156.9, 68.5), (-6.6, -47.6), snr=23),
+        ),
+        electrons_per_dn=2.0,
+        psf_sigma_px=1.09,
+        star_count=25.0,
+        seed=5,
+    )
+    found, of, false, off = pass_of(settings)
+    assert false == 0
+    # At first, and while two stars are not seen, no field tells which of them is the stray.
+    assert found >= 0.8 * of
+    assert np.median(off) < 0.6
