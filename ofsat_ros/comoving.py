@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ofsat_ros.detection import Drift
-from ofsat_ros.following import CENTROID_FLOOR_PX, Paths, follow
-from ofsat_ros.history import History, PastFrame
-from ofsat_ros.pixels import as_complex, positions
+from ofsat_ros.following import CENTROID_FLOOR_PX, Lines, Paths, as_points, follow
+from ofsat_ros.history import History
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -33,8 +32,6 @@ _LEAST_FRAMES = 4
 _ALIKE_SQUARES, _APART_SQUARES = 9.2, 16.0
 # What moved by less over these frames may be an error of the places, px.
 _LEAST_WAY_PX = 0.8
-# Rates of tracks that differ by this part of them, or by less than their errors, are alike.
-_RATE_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -50,7 +47,7 @@ class CoMoving:
     to_sky : list of (3, 3) float64, or None
         Where the history's frames are if those are the stars; None if they are there already.
     tracks : (T,) intp
-        Rows of the rates that are the stars', if tracks are.
+        Which of the tracks are the stars, if any.
     drifts : list of Drift
         What had been taken for the field then.
     """
@@ -62,18 +59,16 @@ class CoMoving:
     drifts: list[Drift] = field(default_factory=list)
 
 
-def find_comoving(history: History, rates: Array, errors: Array) -> CoMoving | None:
+def find_comoving(history: History, tracks: Paths | None = None) -> CoMoving | None:
     """Tell the stars of the newest frame by how they moved over the history.
 
     Parameters
     ----------
     history : History
         The frames, the current one last.
-    rates : (N, 2) float64
-        Of tracks, in the sky plane, px/s.  If no two objects move alike, but tracks do, those are
-        the stars: a telescope that follows an RSO sees it brightest, and standing still.
-    errors : (N,) float64
-        Std of these rates on each axis, px/s.
+    tracks : Paths, optional
+        Of tracks, if the field's motion is in doubt.  Where no two objects move alike but tracks
+        do, those are the stars: a mount that follows an RSO shows it brightest, among streaks.
 
     Returns
     -------
@@ -85,80 +80,107 @@ def find_comoving(history: History, rates: Array, errors: Array) -> CoMoving | N
     if len(earlier) < _LEAST_FRAMES - 1 or not 0 < len(rows) <= _MOST_OBJECTS:
         return None
     paths = follow(frame, earlier, rows)
-    # In the sky plane; and in the image, where a turn that a few vectors made up does no harm.
-    planes = [_Group(paths, paths.places), _Group(paths, _in_image(paths, (frame, *earlier)))]
-    image = len(planes[1]) > len(planes[0])
-    group = planes[image]
+    group = _largest(paths)
     if len(group) < 2:
-        tracks = _moving_alike(rates, errors)
-        if not len(tracks):
-            return None
-        drift: Array = np.average(rates[tracks], axis=0, weights=errors[tracks] ** -2.0)
-        followed = np.flatnonzero(paths.lines.count >= _LEAST_FRAMES)
-        drifts = _drifts(paths, followed, drift, [other.number for other in (frame, *earlier)])
-        there = [_drifted(other, frame, drift) for other in history]
-        return CoMoving(rows[:0], rows[followed], there, tracks, drifts)
+        return None if tracks is None else _told_by_tracks(history, paths, rows, tracks)
     stars = np.flatnonzero(group.members)
     if len(stars) == 2 and np.count_nonzero(paths.lines.count >= _LEAST_FRAMES) > _FEW_OBJECTS:
         return None
     to_sky = None
     # Where nothing moves otherwise, nothing has led the field astray.
-    if group.apart.any() and (image or _have_moved(paths, stars)):
-        to_sky = _straightened(history, paths, stars, image)
+    if group.apart.any() and (group.in_image or _have_moved(paths, stars)):
+        to_sky = _straightened(history, paths, group)
     return CoMoving(rows[stars], rows[group.apart], to_sky)
 
 
+@dataclass(frozen=True)
 class _Group:
-    """The most of N objects that move alike, given their places, (N, K) x + iy px."""
+    """Which of N objects move alike, and which surely not as they do; (N,) each."""
 
-    def __init__(self, paths: Paths, places: NDArray[np.complex128]) -> None:
-        both = paths.found[:, None] & paths.found
-        count = both.sum(axis=2)
-        # Of pairs: what moves the image moves both.
-        between = np.where(both, places[:, None] - places, 0)
-        mean = (both @ paths.times) / np.maximum(count, 1)
-        since = np.where(both, paths.times - mean[..., None], 0)
-        spread = np.maximum((since**2).sum(axis=2), 1e-12)
-        rate = (since * between).sum(axis=2) / spread
-        floor = CENTROID_FLOOR_PX**2 * paths.found
-        variance = (paths.variance + floor).sum(axis=1) / paths.lines.count
-        squares = np.abs(rate) ** 2 * spread / (variance[:, None] + variance)
-        way = np.abs(rate) * np.max(np.where(both, -paths.times, 0), axis=2)
-        known = count >= _LEAST_FRAMES
-        alike = known & ((squares < _ALIKE_SQUARES) | (way < _LEAST_WAY_PX))
-        np.fill_diagonal(alike, paths.lines.count >= _LEAST_FRAMES)
-        # Of groups of as many, that which stands still on the sky as it is; then what agrees best.
-        misfit = np.where(alike, np.minimum(squares, _ALIKE_SQUARES), 0).sum(axis=1)
-        misfit /= 2 * _ALIKE_SQUARES * (len(alike) + 1)
-        own = np.abs(paths.lines.velocity)
-        still = own**2 * paths.lines.spread < _ALIKE_SQUARES * variance
-        still |= own * np.max(np.where(paths.found, -paths.times, 0), axis=1) < _LEAST_WAY_PX
-        self.members = alike[np.argmax(alike.sum(axis=1) + still / 2 - misfit)]
-        apart = known & (squares > _APART_SQUARES) & (way > _LEAST_WAY_PX)
-        inside = apart[:, self.members]
-        self.apart = ~self.members & (2 * inside.sum(axis=1) > np.count_nonzero(self.members))
+    members: Mask
+    apart: Mask
+    in_image: bool
 
     def __len__(self) -> int:
         return int(np.count_nonzero(self.members))
 
 
-def _moving_alike(rates: Array, errors: Array) -> NDArray[np.intp]:
-    """Rows of the most tracks that move alike, two at least and most of all; or none."""
-    if len(rates) < 2:
-        return np.zeros(0, np.intp)
-    off = np.hypot(*(rates[:, None] - rates).transpose(2, 0, 1))
-    speed = np.hypot(*rates.T)
-    reach = np.sqrt(_ALIKE_SQUARES * (errors[:, None] ** 2 + errors**2))
-    alike = off < np.maximum(reach, _RATE_SHARE * np.maximum(speed[:, None], speed))
-    best = np.flatnonzero(alike[np.argmax(alike.sum(axis=1))])
-    return best if len(best) > max(1, len(rates) / 2) else best[:0]
+def _largest(paths: Paths) -> _Group:
+    """The most that move alike on the sky, or in the image if there they are more.
+
+    There, a turn that a few vectors made up does no harm.
+    """
+    sky, image = _group(paths, in_image=False), _group(paths, in_image=True)
+    return image if len(image) > len(sky) else sky
+
+
+def _group(paths: Paths, in_image: bool) -> _Group:
+    variance = (paths.variance + CENTROID_FLOOR_PX**2 * paths.found).sum(axis=1)
+    variance /= paths.lines.count
+    known, squares, way = _compared(paths, paths.image if in_image else paths.places, variance)
+    alike = known & ((squares < _ALIKE_SQUARES) | (way < _LEAST_WAY_PX))
+    np.fill_diagonal(alike, paths.lines.count >= _LEAST_FRAMES)
+    # Of groups of as many, that which stands still on the sky as it is; then what agrees best.
+    own = np.abs(paths.lines.velocity)
+    still = own**2 * paths.lines.spread < _ALIKE_SQUARES * variance
+    still |= own * np.max(np.where(paths.found, -paths.times, 0), axis=1) < _LEAST_WAY_PX
+    misfit = np.where(alike, np.minimum(squares, _ALIKE_SQUARES), 0).sum(axis=1)
+    misfit /= 2 * _ALIKE_SQUARES * (len(alike) + 1)
+    members = alike[np.argmax(alike.sum(axis=1) + still / 2 - misfit)]
+    apart = known & (squares > _APART_SQUARES) & (way > _LEAST_WAY_PX)
+    from_most = 2 * apart[:, members].sum(axis=1) > np.count_nonzero(members)
+    return _Group(members, ~members & from_most, in_image)
+
+
+def _compared(
+    paths: Paths, places: NDArray[np.complex128], variance: Array
+) -> tuple[Mask, Array, Array]:
+    """Compare the rates of N objects in pairs: what moves the image moves both.
+
+    Returns which pairs can be compared, the squared distance of their rates in sigmas, and how
+    far apart they moved, px; (N, N) each.
+    """
+    both = paths.found[:, None] & paths.found
+    count = both.sum(axis=2)
+    between = np.where(both, places[:, None] - places, 0)
+    mean = (both @ paths.times) / np.maximum(count, 1)
+    since = np.where(both, paths.times - mean[..., None], 0)
+    spread = np.maximum((since**2).sum(axis=2), 1e-12)
+    rate = (since * between).sum(axis=2) / spread
+    # Streaks end anywhere: what scatters about its line is known as badly as that.
+    middle = between.sum(axis=2) / np.maximum(count, 1)
+    off = np.where(both, between - middle[..., None] - rate[..., None] * since, 0)
+    scatter = np.sum(np.abs(off) ** 2, axis=2) / np.maximum(2 * (count - 2), 1)
+    squares = np.abs(rate) ** 2 * spread / np.maximum(variance[:, None] + variance, scatter)
+    way = np.abs(rate) * np.max(np.where(both, -paths.times, 0), axis=2)
+    return count >= _LEAST_FRAMES, squares, way
+
+
+def _told_by_tracks(
+    history: History, paths: Paths, rows: NDArray[np.intp], tracks: Paths
+) -> CoMoving | None:
+    """Take the most tracks that move alike, two at least and most of all, for the stars."""
+    if not len(tracks.rows):
+        return None
+    group = _largest(tracks)
+    if len(group) <= max(1, len(tracks.rows) / 2):
+        return None
+    velocity = tracks.lines.velocity[group.members].mean()
+    followed = np.flatnonzero(paths.lines.count >= _LEAST_FRAMES)
+    return CoMoving(
+        stars=rows[:0],
+        strays=rows[followed],
+        to_sky=_straightened(history, tracks, group),
+        tracks=np.flatnonzero(group.members),
+        drifts=_drifts(paths, followed, velocity, [frame.number for frame in history][::-1]),
+    )
 
 
 def _drifts(
-    paths: Paths, followed: NDArray[np.intp], stars: Array, numbers: list[int]
+    paths: Paths, followed: NDArray[np.intp], stars: complex, numbers: list[int]
 ) -> list[Drift]:
-    """Followed objects as what drifts against stars of that rate, px/s."""
-    off = np.abs(paths.lines.velocity - complex(*stars))
+    """Followed objects as what drifts against stars of that rate, x + iy px/s."""
+    off = np.abs(paths.lines.velocity - stars)
     sigmas = off * np.sqrt(paths.lines.spread) / paths.error
     log_false = np.log(len(paths.rows)) - sigmas**2 / 2
     return [
@@ -168,23 +190,6 @@ def _drifts(
         )
         for which in followed.tolist()
     ]
-
-
-def _drifted(frame: PastFrame, newest: PastFrame, drift: Array) -> Array:
-    """Where a frame is on the sky if the stars drift by so much there, px/s."""
-    back = np.eye(3)
-    back[:2, 2] = -drift * frame.seconds_since(newest)
-    return back @ frame.to_sky
-
-
-def _in_image(paths: Paths, frames: tuple[PastFrame, ...]) -> NDArray[np.complex128]:
-    """The places in the frames' own pixels, (N, K)."""
-    places = np.zeros(paths.places.shape, np.complex128)
-    for column, frame in enumerate(frames):
-        there = paths.found[:, column]
-        xy = positions(frame.objects)[paths.rows[there, column]]
-        places[there, column] = as_complex(xy)
-    return places
 
 
 def _have_moved(paths: Paths, stars: NDArray[np.intp]) -> bool:
@@ -198,25 +203,28 @@ def _have_moved(paths: Paths, stars: NDArray[np.intp]) -> bool:
     return bool(np.any(way > np.maximum(_LEAST_WAY_PX, np.sqrt(2 * _APART_SQUARES / total))))
 
 
-def _straightened(
-    history: History, paths: Paths, stars: NDArray[np.intp], turned: bool
-) -> list[Array]:
-    """Where the frames are if the stars stand still; `turned` as the newest one if so asked."""
-    newest = history[-1]
-    now = paths.places[stars, 0]
-    places = []
-    shift = np.zeros(2)
-    for column, frame in enumerate(list(history)[::-1]):
-        matrix = frame.to_sky.copy()
-        if turned:
+def _straightened(history: History, paths: Paths, group: _Group) -> list[Array]:
+    """Where the frames are if a group stands still; turned as the newest one if that tells it."""
+    newest, stars = history[-1], np.flatnonzero(group.members)
+    lines = Lines(paths.times, paths.image[stars], paths.found[stars])
+    now = np.where(paths.found[stars, 0], paths.image[stars, 0], lines.at(0.0))
+    sky = newest.sky(as_points(now))
+    matrices = [frame.to_sky.copy() for frame in history][::-1]
+    shifts = np.zeros((len(matrices), 2))
+    for column, matrix in enumerate(matrices):
+        if group.in_image:
             matrix[:2, :2] = newest.to_sky[:2, :2]
         there = paths.found[stars, column]
         if there.any():
-            xy = positions(frame.objects)[paths.rows[stars[there], column]]
             weight = 1 / (paths.variance[stars[there], column] + CENTROID_FLOOR_PX**2)
-            sky = np.stack([now[there].real, now[there].imag], axis=1)
-            shift = weight @ (sky - xy @ matrix[:2, :2].T) / weight.sum() - matrix[:2, 2]
-        # A frame that shows none of them goes with the one after it.
+            xy = as_points(paths.image[stars[there], column])
+            off = sky[there] - xy @ matrix[:2, :2].T - matrix[:2, 2]
+            shifts[column] = weight @ off / weight.sum()
+    known = paths.found[stars].any(axis=0) | (paths.times == 0)
+    # A frame that shows none of them lies between, or beyond, those that do.
+    for axis in (0, 1):
+        line = np.polyfit(paths.times[known], shifts[known, axis], 1)
+        shifts[~known, axis] = np.polyval(line, paths.times[~known])
+    for matrix, shift in zip(matrices, shifts, strict=True):
         matrix[:2, 2] += shift
-        places.append(matrix)
-    return places[::-1]
+    return matrices[::-1]

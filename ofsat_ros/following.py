@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ofsat_ros.history import PastFrame
-from ofsat_ros.pixels import as_complex
+from ofsat_ros.pixels import as_complex, positions
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -73,6 +73,8 @@ class Paths:
         Which object each is there; -1 where it was not found.
     places : (N, K) complex128
         Its place in the sky plane, x + iy px; 0 where it was not found.
+    image : (N, K) complex128
+        The same in the frame's own pixels.
     variance : (N, K) float64
         Of the centroid along one axis, px^2; 0 where it was not found.
     """
@@ -80,6 +82,7 @@ class Paths:
     times: Array
     rows: NDArray[np.intp]
     places: NDArray[np.complex128]
+    image: NDArray[np.complex128]
     variance: Array
 
     @cached_property
@@ -118,7 +121,11 @@ def follow(frame: PastFrame, earlier: list[PastFrame], followed: NDArray[np.intp
         rows[near, column], variance[near, column] = there, centroid_variance(other.objects[there])
         last[near] = places[near, column] = as_complex(other.object_sky[there])
         misses += rows[:, column] < 0
-    return Paths(times, rows, places, variance)
+    image = np.zeros(shape, np.complex128)
+    for column, other in enumerate((frame, *earlier)):
+        seen = np.flatnonzero(rows[:, column] >= 0)
+        image[seen, column] = as_complex(positions(other.objects)[rows[seen, column]])
+    return Paths(times, rows, places, image, variance)
 
 
 def _nearest(other: PastFrame, sky: Array, flux: Array) -> NDArray[np.intp]:

@@ -342,7 +342,9 @@ class Pipeline:
         before = self._previous
         if before is None or result.star_field is None:
             return current, []
-        comoving = find_comoving(self._history, *self._tracker.rates())
+        doubtful = result.star_field.is_doubtful
+        tracks = self._tracker.paths(self._history) if doubtful else None
+        comoving = find_comoving(self._history, tracks)
         if comoving is None:
             # What was no star does not become one because stars are hidden.
             strays = np.unique(result.flow.object_index[before.leads_astray(result.flow)])

@@ -36,6 +36,8 @@ _MOST_CHANCE, _APART_PX = 1e-2, 1.5
 _SURE_SIGMAS = 5.0
 # Cut of Tukey's biweight, in sigmas: 95 % efficiency on Gaussian errors.
 _TUKEY = 4.685
+# Stars scatter by less than so many times as much as stated.
+_DOUBTFUL_SIGMAS = 3.0
 # The fit has converged when no vector of the field changes by more than this, px.
 _CONVERGED_PX = 1e-4
 # What the vectors say so much less of than of the rest, they do not say.
@@ -160,6 +162,11 @@ class StarFieldMotion:
             tries = float(max(1, objects[0] * objects[1])) ** given
             carried, found = carried - given, found - given
         return bool(np.log(tries) + _log_chance(found, carried, share) < np.log(_MOST_CHANCE))
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether it may be that of RSOs: one object's, or one that its vectors contradict."""
+        return self.star_count < 2 or self.residual_sigmas > _DOUBTFUL_SIGMAS
 
     @property
     def turns(self) -> bool:

@@ -38,7 +38,7 @@ ALLOWED = {
         *("optical_flow", "star_field", "history", "following"),
     },
     "comoving": {"pixels", "history", "following", "detection"},
-    "tracking": {"pixels", "history", "detection"},
+    "tracking": {"pixels", "history", "following", "detection"},
     "comparison": {"parameters", "optical_flow", "star_field"},
     "frame_result": STAGES - {"history"},
     "pipeline": {

@@ -69,6 +69,15 @@ def test_sensitivity_at_the_ends_of_its_curve():
     assert float(cells(told, "20")[1]) > 0.8
 
 
+def test_few_stars_of_one_kind():
+    told = run("few_stars", "--seeds", "2", "--stars", "64", "--jobs", "1")
+    for pointing in ("stands still", "drifts"):
+        _, stars, found, live, false, false_live = cells(told, pointing)
+        assert stars == "64"
+        assert min(float(found), float(live)) > 0.9
+        assert max(float(false), float(false_live)) < 0.05
+
+
 def test_optics_of_one_row():
     told = run("optics", "--seeds", "1", "--rows", "3", "--jobs", "1")
     _, name, value, before, after, _ = cells(told, "FWHM 1.0 px, RSOs at rest")

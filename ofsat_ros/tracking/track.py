@@ -16,6 +16,7 @@ from statistics import median
 import numpy as np
 from numpy.typing import NDArray
 
+from ofsat_ros.following import Paths
 from ofsat_ros.history import PastFrame
 from ofsat_ros.pixels import positions
 from ofsat_ros.tracking.sightings import STREAK_SPREAD
@@ -260,6 +261,21 @@ def places(tracks: Sequence[Track], frame: PastFrame) -> Array:
     ahead = [(frame.stamp_ns - track.stamp_ns) / 1e9 for track in tracks]
     states = np.array([track.state for track in tracks]).reshape(-1, 4)
     return frame.pixels(states[:, :2] + np.array(ahead)[:, None] * states[:, 2:])
+
+
+def paths_of(tracks: Sequence[Track], frames: Sequence[PastFrame]) -> Paths:
+    """Where N tracks were seen in frames, the newest first."""
+    shape = len(tracks), len(frames)
+    rows, variance = np.full(shape, -1, np.intp), np.zeros(shape)
+    sky, image = np.zeros((2, *shape), np.complex128)
+    for row, track in enumerate(tracks):
+        for column, frame in enumerate(frames):
+            if (hit := track.hits.get(frame.number)) is not None:
+                at = row, column
+                rows[at], variance[at] = 0, np.trace(hit.covariance) / 2
+                sky[at], image[at] = complex(*hit.sky), complex(*hit.xy)
+    times = np.array([frame.seconds_since(frames[0]) for frame in frames])
+    return Paths(times, rows, sky, image, variance)
 
 
 def add_hits(tracks: Sequence[Track], hits: Sequence[Hit]) -> None:

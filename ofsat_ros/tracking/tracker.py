@@ -24,6 +24,7 @@ from ofsat_ros.detection import (
     WINGS_PX,
     Drift,
 )
+from ofsat_ros.following import Paths
 from ofsat_ros.history import History, PastFrame
 from ofsat_ros.pixels import as_complex, positions
 from ofsat_ros.tracking.assignment import SLOW_PX, as_spots, assign
@@ -33,7 +34,7 @@ from ofsat_ros.tracking.rows import TRACK_DTYPE, Settled, detection_rows, track_
 from ofsat_ros.tracking.sharpness import is_sharper_than_stars
 from ofsat_ros.tracking.sightings import Sighting
 from ofsat_ros.tracking.staying import moves_on
-from ofsat_ros.tracking.track import Hit, Track, add_hits, places, predict
+from ofsat_ros.tracking.track import Hit, Track, add_hits, paths_of, places, predict
 
 Array = NDArray[np.float64]
 # Looks in a frame, compared with others, near a point: none or one SPOT_DTYPE.
@@ -118,12 +119,9 @@ class Tracker:
             self._tracks, self._ended, self._sightings = [], [], []
         return self._last_word.said()
 
-    def rates(self) -> tuple[Array, Array]:
-        """Velocities (N, 2) in the sky plane of tracks seen for a while, px/s, and stds (N,)."""
-        tracks = self._seen_for_a_while()
-        rates = np.array([track.state[2:] for track in tracks]).reshape(-1, 2)
-        traces = [np.trace(track.covariance[2:, 2:]) for track in tracks]
-        return rates, np.sqrt(np.array(traces) / 2)
+    def paths(self, history: History) -> Paths:
+        """Where the tracks that were seen for a while were in a history's frames."""
+        return paths_of(self._seen_for_a_while(), list(history)[::-1])
 
     def _seen_for_a_while(self) -> list[Track]:
         return [track for track in self._tracks if len(track.hits) >= _RATE_HITS]
@@ -135,10 +133,9 @@ class Tracker:
 
         Tracks that are stars are withdrawn: those that stand still on the new sky, sooner if they
         are at the places `stars`, (N, 2) px in the newest frame, and those of the rows `followed`
-        of `rates`.
+        of `paths`.
         """
-        known = self._seen_for_a_while()
-        gone = {known[row].track_id for row in followed}
+        gone = {self._seen_for_a_while()[row].track_id for row in followed}
         frames = {frame.number: frame for frame in history}
         for track in (*self._tracks, *self._ended):
             track.see_in(frames)
@@ -147,8 +144,7 @@ class Tracker:
             if (frame := frames.get(sighting.frame.number)) is not None:
                 before = self._sightings[-1] if self._sightings else None
                 self._sightings.append(sighting.seen_in(frame, before))
-        at = places(self._tracks, history[-1])
-        for track, place in zip(self._tracks, at, strict=True):
+        for track, place in zip(self._tracks, places(self._tracks, history[-1]), strict=True):
             is_near = np.any(np.hypot(*(stars - place).T) < _PIECE_PX)
             if track.stands_still(_LEAST_HITS) if is_near else track.stands_still():
                 gone.add(track.track_id)
