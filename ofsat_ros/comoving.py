@@ -83,9 +83,9 @@ def find_comoving(history: History, tracks: Paths | None = None) -> CoMoving | N
     group = _largest(paths)
     if len(group) < 2:
         return None if tracks is None else _told_by_tracks(history, paths, rows, tracks)
-    stars = np.flatnonzero(group.members)
-    if len(stars) == 2 and np.count_nonzero(paths.lines.count >= _LEAST_FRAMES) > _FEW_OBJECTS:
+    if group.may_be_chance(paths):
         return None
+    stars = np.flatnonzero(group.members)
     to_sky = None
     # Where nothing moves otherwise, nothing has led the field astray.
     if group.apart.any() and (group.in_image or _have_moved(paths, stars)):
@@ -103,6 +103,11 @@ class _Group:
 
     def __len__(self) -> int:
         return int(np.count_nonzero(self.members))
+
+    def may_be_chance(self, paths: Paths) -> bool:
+        """Whether there are so many to choose from that two of them move alike by chance."""
+        known = int(np.count_nonzero(paths.lines.count >= _LEAST_FRAMES))
+        return len(self) == 2 and known > _FEW_OBJECTS
 
 
 def _largest(paths: Paths) -> _Group:
@@ -159,11 +164,11 @@ def _compared(
 def _told_by_tracks(
     history: History, paths: Paths, rows: NDArray[np.intp], tracks: Paths
 ) -> CoMoving | None:
-    """Take the most tracks that move alike, two at least and most of all, for the stars."""
+    """Take the most tracks that move alike, two at least, for the stars."""
     if not len(tracks.rows):
         return None
     group = _largest(tracks)
-    if len(group) <= max(1, len(tracks.rows) / 2):
+    if len(group) < 2 or group.may_be_chance(tracks):
         return None
     velocity = tracks.lines.velocity[group.members].mean()
     followed = np.flatnonzero(paths.lines.count >= _LEAST_FRAMES)

@@ -182,6 +182,13 @@ def test_tracks_that_move_alike_are_the_stars_where_no_objects_do():
     assert all(drift.log_false < -1e4 for drift in found.drifts)
 
 
+def test_two_tracks_of_four_that_move_exactly_alike_are_stars():
+    lone = history_of([path(np.array([130.0, 120.0]))])
+    found = find_comoving(lone, tracks_of([*RATES[:2], RATES[3], (1.0, 0.5)]))
+    assert found.tracks.tolist() == [0, 1]
+    assert found.strays.tolist() == [0]
+
+
 def test_a_train_of_satellites_among_stars_is_not_the_stars():
     found = find_comoving(history_of([*map(path, STARS[:2])]), tracks_of(RATES[:3]))
     assert found.stars.tolist() == [0, 1]
