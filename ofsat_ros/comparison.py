@@ -31,6 +31,8 @@ _ON_PX, _ON_SHARE = 3.0, 0.25
 _NEAR_PX = 10.0
 # By a motion that is less sure than this, px, stars pass for what moves; hundredths are usual.
 _SUREST_PX = 0.25
+# A lone star goes on as the field did within this, and so many of its sigmas, px.
+_SAME_PX, _SAME_SIGMAS = 1.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -166,16 +168,12 @@ def find_motion(
         Whether it is more than chance shows.
     """
     valid = flow.valid & ~before.leads_astray(flow)
-    motion = estimate_motion(
-        flow.position[valid],
-        flow.displacement[valid],
-        flow.sigma[valid],
-        flow.speed_mean[valid],
-        now.flow_input.smoothed.shape,
-        parameters.star_field_model,
-        parameters.outlier_sigmas,
-        expected,
-    )
+    motion = _motion_of(flow, valid, now, expected, parameters)
+    if motion is None and expected is not None and len(before.strays):
+        # Where the others are known to be no stars, one that goes on as they did tells enough.
+        off = np.hypot(*(flow.displacement - expected.displacement_at(flow.position)).T)
+        valid &= off <= _SAME_PX + _SAME_SIGMAS * flow.sigma.mean(axis=1)
+        motion = _motion_of(flow, valid, now, expected, parameters)
     if motion is None:
         return None, False
     # As published, the mean is never doubted.
@@ -185,6 +183,25 @@ def find_motion(
     inliers = np.zeros(len(flow), bool)
     inliers[valid] = motion.inliers
     return motion.with_inliers(inliers), believed
+
+
+def _motion_of(
+    flow: Flow,
+    rows: NDArray[np.bool_],
+    now: Seen,
+    expected: StarFieldMotion | None,
+    parameters: Parameters,
+) -> StarFieldMotion | None:
+    return estimate_motion(
+        flow.position[rows],
+        flow.displacement[rows],
+        flow.sigma[rows],
+        flow.speed_mean[rows],
+        now.flow_input.smoothed.shape,
+        parameters.star_field_model,
+        parameters.outlier_sigmas,
+        expected,
+    )
 
 
 def why_not_placed(motion: StarFieldMotion, expected: StarFieldMotion | None) -> str:

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sky import frame_of
+from blobs import blobs, camera, flux
+from sky import SECOND_NS, frame_of
 
 from ofsat_ros.comoving import CoMoving, find_comoving
 from ofsat_ros.following import Paths
@@ -280,3 +281,27 @@ def test_stars_that_streak_past_two_rsos_that_are_followed_are_not_tracks():
     # At first, and while two stars are not seen, no field tells which of them is the stray.
     assert found >= 0.8 * of
     assert np.median(off) < 0.6
+
+
+@pytest.mark.parametrize("shown", [1, 2])
+def test_one_star_is_a_field_where_the_others_are_known_to_be_none(shown):
+    """Three stars, then fewer, and three RSOs as bright that drift by 0.7 px a frame."""
+    rng, pipeline, step = np.random.default_rng(6), Pipeline(), np.array([0.8, -0.5])
+    stars = np.array([(40.0, 50.0), (130.0, 60.0), (80.0, 130.0)])
+    rsos = np.array([(100.0, 100.0), (60.0, 90.0), (120.0, 30.0)])
+    drifts = np.array([(0.6, 0.3), (-0.5, 0.5), (0.3, -0.6)])
+    for number in range(14):
+        seen = stars if number < 9 else stars[:shown]
+        xy = np.concatenate([seen + number * step, rsos + number * (drifts + step)])
+        if number >= 9:
+            # One more comes out of the cloud, of which nothing is known yet.
+            xy = np.concatenate([xy, [(30.0, 150.0) + (number - 9) * np.array([3.5, 1.5])]])
+        result = pipeline.process(
+            camera(blobs((180, 180), xy, flux(30), 1.0), rng), number * SECOND_NS
+        )
+        if number < 6:
+            continue
+        assert result.star_field is not None, number
+        # Two centroids of SNR 30 are known to 0.1 px.
+        assert result.star_field.displacement == pytest.approx(step, abs=0.4)
+        assert {1, 2, 3} <= set(result.detections["track_id"]), number
