@@ -73,11 +73,13 @@ def find_comoving(history: History, tracks: Paths | None = None) -> CoMoving | N
     Returns
     -------
     CoMoving or None
-        None where there is nothing to tell: many objects, or nothing that moves alike.
+        None where nothing tells; of many objects, that none is a stray.
     """
     frame, earlier = history[-1], list(history)[-2::-1]
     rows = np.flatnonzero(~frame.objects["edge"])
-    if len(earlier) < _LEAST_FRAMES - 1 or not 0 < len(rows) <= _MOST_OBJECTS:
+    if len(rows) > _MOST_OBJECTS:
+        return CoMoving(rows[:0], rows[:0], None)
+    if len(earlier) < _LEAST_FRAMES - 1 or not len(rows):
         return None
     paths = follow(frame, earlier, rows)
     group = _largest(paths)
@@ -128,11 +130,13 @@ def _group(paths: Paths, in_image: bool) -> _Group:
     # Of groups of as many, that which stands still on the sky as it is; then what agrees best.
     own = np.abs(paths.lines.velocity)
     still = own**2 * paths.lines.spread < _ALIKE_SQUARES * variance
-    still |= own * np.max(np.where(paths.found, -paths.times, 0), axis=1) < _LEAST_WAY_PX
+    still |= own * _span(paths) < _LEAST_WAY_PX
     misfit = np.where(alike, np.minimum(squares, _ALIKE_SQUARES), 0).sum(axis=1)
     misfit /= 2 * _ALIKE_SQUARES * (len(alike) + 1)
-    members = alike[np.argmax(alike.sum(axis=1) + still / 2 - misfit)]
+    members = alike[np.argmax(alike.sum(axis=1) + still / 2 - misfit)].copy()
     apart = known & (squares > _APART_SQUARES) & (way > _LEAST_WAY_PX)
+    # A faint object agrees with all others; they need not with each other.
+    members &= 2 * apart[:, members].sum(axis=1) <= np.count_nonzero(members)
     from_most = 2 * apart[:, members].sum(axis=1) > np.count_nonzero(members)
     return _Group(members, ~members & from_most, in_image)
 
@@ -145,7 +149,8 @@ def _compared(
     Returns which pairs can be compared, the squared distance of their rates in sigmas, and how
     far apart they moved, px; (N, N) each.
     """
-    both = paths.found[:, None] & paths.found
+    # Pieces of one object share its past, which says nothing of two.
+    both = paths.found[:, None] & paths.found & (paths.rows[:, None] != paths.rows)
     count = both.sum(axis=2)
     between = np.where(both, places[:, None] - places, 0)
     mean = (both @ paths.times) / np.maximum(count, 1)
@@ -171,30 +176,28 @@ def _told_by_tracks(
     if len(group) < 2 or group.may_be_chance(tracks):
         return None
     velocity = tracks.lines.velocity[group.members].mean()
-    followed = np.flatnonzero(paths.lines.count >= _LEAST_FRAMES)
+    off = np.abs(paths.lines.velocity - velocity)
+    sigmas = off * np.sqrt(paths.lines.spread) / paths.error
+    apart = (paths.lines.count >= _LEAST_FRAMES) & (sigmas**2 > _APART_SQUARES)
+    strays = np.flatnonzero(apart & (off * _span(paths) > _LEAST_WAY_PX))
+    log_false = np.log(len(rows)) - sigmas**2 / 2
+    numbers = [frame.number for frame in history][::-1]
+    found = [zip(numbers, paths.rows[which].tolist(), strict=True) for which in strays]
     return CoMoving(
         stars=rows[:0],
-        strays=rows[followed],
+        strays=rows[strays],
         to_sky=_straightened(history, tracks, group),
         tracks=np.flatnonzero(group.members),
-        drifts=_drifts(paths, followed, velocity, [frame.number for frame in history][::-1]),
+        drifts=[
+            Drift({number: row for number, row in path if row >= 0}, float(log_false[which]))
+            for which, path in zip(strays, found, strict=True)
+        ],
     )
 
 
-def _drifts(
-    paths: Paths, followed: NDArray[np.intp], stars: complex, numbers: list[int]
-) -> list[Drift]:
-    """Followed objects as what drifts against stars of that rate, x + iy px/s."""
-    off = np.abs(paths.lines.velocity - stars)
-    sigmas = off * np.sqrt(paths.lines.spread) / paths.error
-    log_false = np.log(len(paths.rows)) - sigmas**2 / 2
-    return [
-        Drift(
-            {n: int(row) for n, row in zip(numbers, paths.rows[which], strict=True) if row >= 0},
-            float(log_false[which]),
-        )
-        for which in followed.tolist()
-    ]
+def _span(paths: Paths) -> Array:
+    """Since when each was found, (N,) s."""
+    return np.max(np.where(paths.found, -paths.times, 0), axis=1)
 
 
 def _have_moved(paths: Paths, stars: NDArray[np.intp]) -> bool:
@@ -216,8 +219,11 @@ def _straightened(history: History, paths: Paths, group: _Group) -> list[Array]:
     sky = newest.sky(as_points(now))
     matrices = [frame.to_sky.copy() for frame in history][::-1]
     shifts = np.zeros((len(matrices), 2))
+    middle = (np.array(newest.shape[::-1]) - 1) / 2
     for column, matrix in enumerate(matrices):
         if group.in_image:
+            # About the middle: what a turn about a corner moves would pass for a shift.
+            matrix[:2, 2] += (matrix[:2, :2] - newest.to_sky[:2, :2]) @ middle
             matrix[:2, :2] = newest.to_sky[:2, :2]
         there = paths.found[stars, column]
         if there.any():

@@ -84,11 +84,14 @@ class Seen:
         return int(np.count_nonzero(self.clear & far))
 
     def leads_astray(self, flow: Flow) -> NDArray[np.bool_]:
-        """Which vectors of a flow from this frame come from one of its strays, (N,)."""
+        """Which vectors of a flow from this frame come from one of its strays, (N,).
+
+        Valid or not: a stray whose vector is none is still one.
+        """
         stray = np.zeros(len(flow), bool)
         if len(self.strays):
             start = flow.position - flow.displacement
-            rows = np.flatnonzero(flow.valid & self.flow_input.contains(start))
+            rows = np.flatnonzero(self.flow_input.contains(start))
             stray[rows] = np.isin(self.flow_input.object_at(start[rows]), self.strays)
         return stray
 
@@ -167,12 +170,14 @@ def find_motion(
     believed : bool
         Whether it is more than chance shows.
     """
-    valid = flow.valid & ~before.leads_astray(flow)
+    valid = flow.valid
+    if parameters.rso_test == "history":
+        valid = valid & ~before.leads_astray(flow)
     motion = _motion_of(flow, valid, now, expected, parameters)
     if motion is None and expected is not None and len(before.strays):
         # Where the others are known to be no stars, one that goes on as they did tells enough.
         off = np.hypot(*(flow.displacement - expected.displacement_at(flow.position)).T)
-        valid &= off <= _SAME_PX + _SAME_SIGMAS * flow.sigma.mean(axis=1)
+        valid = valid & (off <= _SAME_PX + _SAME_SIGMAS * flow.sigma.mean(axis=1))
         motion = _motion_of(flow, valid, now, expected, parameters)
     if motion is None:
         return None, False

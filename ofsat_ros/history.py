@@ -233,7 +233,7 @@ class History:
     def straighten(self, to_sky: Sequence[Array]) -> None:
         """Give all frames other places on the sky: matrices (3, 3) as `PastFrame.to_sky`."""
         for index, matrix in enumerate(to_sky):
-            self._frames[index] = replace(self._frames[index], to_sky=matrix)
+            self._frames[index] = replace(self._frames[index], to_sky=matrix, scatter=1.0)
 
     def place(self, motion: StarFieldMotion | None, since: Array | None = None) -> Array:
         """Matrix from px of a new frame to the sky plane, (3, 3).

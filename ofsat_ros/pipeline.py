@@ -340,7 +340,8 @@ class Pipeline:
     def _straighten(self, current: Seen, result: FrameResult) -> tuple[Seen, list[Drift]]:
         """Tell what is no star where there are few, and put right what was taken for one."""
         before = self._previous
-        if before is None or result.star_field is None:
+        # A frame that others are not compared with puts nothing right.
+        if before is None or result.star_field is None or self._blind:
             return current, []
         doubtful = result.star_field.is_doubtful
         tracks = self._tracker.paths(self._history) if doubtful else None
@@ -349,17 +350,19 @@ class Pipeline:
             # What was no star does not become one because stars are hidden.
             strays = np.unique(result.flow.object_index[before.leads_astray(result.flow)])
             return replace(current, strays=strays[strays >= 0]), []
-        if comoving.to_sky is not None:
+        stamps = [frame.stamp_ns for frame in self._history]
+        if comoving.to_sky is not None and before.stamp_ns in stamps:
             history, motion, flow = self._history, result.star_field, result.flow
             history.straighten(comoving.to_sky)
             stars = positions(result.objects)[comoving.stars]
             self._tracker.straighten(history, stars, comoving.tracks)
-            for frame in history:
-                if frame.stamp_ns == before.stamp_ns:
-                    motion = motion.led_by(frame.from_sky @ history[-1].to_sky)
+            there = history[stamps.index(before.stamp_ns)]
+            motion = motion.led_by(there.from_sky @ history[-1].to_sky)
             inliers = flow.valid & np.isin(flow.object_index, comoving.stars)
-            result.star_field = motion.with_inliers(inliers) if inliers.any() else motion
-            self._field_rate = motion.over(1 / result.dt_s)
+            if not inliers.any():
+                inliers = motion.inliers & ~np.isin(flow.object_index, comoving.strays)
+            result.star_field = motion.with_inliers(inliers)
+            self._field_rate = result.star_field.over(1 / result.dt_s)
         return replace(current, strays=comoving.strays), comoving.drifts
 
     def _track(

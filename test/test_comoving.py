@@ -6,14 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from blobs import blobs, camera, flux
-from sky import SECOND_NS, frame_of
+from sky import SECOND_NS, frame_of, spots_at
 
 from ofsat_ros.comoving import CoMoving, find_comoving
 from ofsat_ros.following import Paths
 from ofsat_ros.history import History
 from ofsat_ros.objects import OBJECT_DTYPE
+from ofsat_ros.parameters import Parameters
 from ofsat_ros.pipeline import Pipeline
 from ofsat_ros.simulation import RSO, SimulatorSettings, SkySimulator
+from ofsat_ros.star_field import _mean_motion
+from ofsat_ros.tracking import Tracker
+from ofsat_ros.tracking.track import Hit, Track, predict
 
 FRAMES, SIDE = 9, 256
 MIDDLE = (SIDE - 1) / 2
@@ -26,8 +30,9 @@ def history_of(
     wrong: tuple[float, float] = (0.0, 0.0),
     seed: int = 1,
     turn: float = 0.0,
+    sigma: float | np.ndarray = SIGMA,
 ) -> History:
-    """Frames of objects with these paths, (FRAMES, 2) px each, and noise of SIGMA.
+    """Frames of objects with these paths, (FRAMES, 2) px each, and noise of `sigma`.
 
     The frames' places on the sky follow a field that moves by (2, 1) px a frame and turns by
     `turn` rad, but for what is `wrong`, px per frame.
@@ -36,9 +41,9 @@ def history_of(
     for number in range(FRAMES):
         objects = np.zeros(len(paths), OBJECT_DTYPE)
         xy = np.array([path[number] for path in paths]).reshape(-1, 2)
-        xy += rng.normal(0, SIGMA, (len(paths), 2))
+        xy += rng.normal(0, 1, (len(paths), 2)) * np.reshape(sigma, (-1, 1))
         objects["x"], objects["y"] = xy.T
-        objects["sigma_x"] = objects["sigma_y"] = SIGMA
+        objects["sigma_x"] = objects["sigma_y"] = sigma
         objects["flux"], objects["snr"] = 1000.0, 10.0
         history.add(replace(frame_of(number, SIDE, sky_of(number, wrong, turn)), objects=objects))
     return history
@@ -118,6 +123,53 @@ def test_stars_that_shake_lead_nothing_astray():
     assert found.to_sky is None
 
 
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("faint", [0.6, 0.9])
+def test_a_faint_object_that_agrees_with_all_joins_no_rso_to_the_stars(faint, seed):
+    drift = (0.2, -0.1)
+    rso, star = path(np.array([130.0, 120.0]), drift), path(np.array([90.0, 30.0]))
+    sigma = np.array([0.1, 0.1, 0.1, 0.03, faint])
+    history = history_of([*map(path, STARS[:3]), rso, star], drift, seed, sigma=sigma)
+    found = find_comoving(history)
+    assert {0, 1, 2} <= set(found.stars.tolist()) <= {0, 1, 2, 4}
+    assert found.strays.tolist() == [3]
+    sky = placed(history, found)[:, :3]
+    # Not weighed by the RSO, whose way in nine frames is 1.8 px.
+    assert np.abs((sky[0] - sky[-1]).mean(axis=0)).max() < 0.4
+
+
+def test_two_pieces_of_an_rso_are_no_two_stars():
+    """In the newest frame noise splits it; before, both pieces are the same object."""
+    drift = (0.5, -0.4)
+    whole = path(np.array([130.0, 120.0]), drift)
+    piece = np.full_like(whole, -50.0)
+    piece[-1] = whole[-1] + (2.0, 1.5)
+    found = find_comoving(history_of([*map(path, STARS[:2]), whole, piece], drift))
+    assert found.stars.tolist() == [0, 1]
+    assert 2 in found.strays
+
+
+@pytest.mark.parametrize("missing", [[4], [0, 1]])
+def test_a_frame_without_stars_lies_between_those_that_show_them(missing):
+    """Its turn was made up, too: about the image's middle, not about its corner."""
+    history = history_of([*map(path, STARS), path(np.array([130.0, 120.0]), (0.5, -0.4))])
+    turns = np.random.default_rng(8).normal(0, 0.02, FRAMES)
+    frames, history = list(history), History(FRAMES)
+    for frame, turn in zip(frames, turns, strict=True):
+        made_up = sky_of(1, (-2.0, -1.0), turn)
+        objects = frame.objects[: 0 if frame.number in missing else None]
+        history.add(replace(frame, to_sky=frame.to_sky @ made_up, objects=objects))
+    found = find_comoving(history)
+    assert found.stars.tolist() == [0, 1, 2, 3]
+    true = [sky_of(frame.number, (0, 0), 0) for frame in history]
+    history.straighten(found.to_sky)
+    back = np.linalg.inv(true[-1]) @ true
+    middle = np.array([MIDDLE, MIDDLE, 1.0])
+    now = np.linalg.inv(history[-1].to_sky)
+    for frame, matrix in zip(history, back, strict=True):
+        assert now @ frame.to_sky @ middle == pytest.approx(matrix @ middle, abs=0.6)
+
+
 def test_a_star_that_was_missed_is_one():
     paths = [*map(path, STARS[:3]), path(np.array([130.0, 120.0]), (0.5, -0.4))]
     paths[1][[3, 6]] = (10.0, 10.0)
@@ -136,7 +188,8 @@ def test_what_can_not_be_told_is_not():
     assert find_comoving(history_of([])) is None
     rng = np.random.default_rng(3)
     many = [path(start) for start in rng.uniform(20, 200, (31, 2))]
-    assert find_comoving(history_of(many)) is None
+    found = find_comoving(history_of(many))
+    assert (len(found.stars), len(found.strays), found.to_sky) == (0, 0, None)
     short = History(3)
     for frame in list(history_of([*map(path, STARS)]))[:3]:
         short.add(frame)
@@ -155,9 +208,9 @@ def tracks_of(rates: list[tuple[float, float]], seed: int = 1) -> Paths:
     ages = np.arange(FRAMES)
     sky = ELSEWHERE[: len(rates), None] - ages[:, None] * np.reshape(rates, (-1, 1, 2))
     sky = sky + noise + shift
-    rows = np.zeros((len(rates), FRAMES), np.intp)
+    rows = np.tile(np.arange(len(rates))[:, None], FRAMES)
     rows[:, 0] = -1
-    seen = rows == 0
+    seen = rows >= 0
     newest = (2.0, 1.0) * np.array([FRAMES - 1])[:, None]
     image = sky - shift + newest - ages[:, None] * (2.0, 1.0)
     places, pixels = (np.where(seen, xy[..., 0] + 1j * xy[..., 1], 0) for xy in (sky, image))
@@ -206,12 +259,66 @@ def test_tracks_that_are_too_few_or_not_alike_tell_nothing(rates):
     assert find_comoving(lone, tracks_of(rates)) is None
 
 
+# What is placed anew
+
+
+def test_the_motion_is_the_one_that_the_places_say():
+    """A turn, a change of scale and a shift, to a matrix and back."""
+    motion = _mean_motion(np.array([[3.0, -2.0]]), np.ones(1), np.array([MIDDLE, MIDDLE]), 2.0)
+    motion = replace(motion, rotation=0.03, scale=-0.004)
+    history = History(2)
+    history.add(frame_of(0, SIDE, sky_of(3, (0.5, 1.0), 0.2)))
+    history.add(frame_of(1, SIDE, history.place(motion)))
+    back = history[0].from_sky @ history[1].to_sky
+    other = replace(motion, displacement=np.zeros(2), rotation=0.0, scale=0.0).led_by(back)
+    assert other.displacement == pytest.approx([3.0, -2.0])
+    assert (other.rotation, other.scale) == pytest.approx((0.03, -0.004))
+
+
+def track_of(frames: list, velocity: np.ndarray) -> Track:
+    """A track with a hit in each frame, that moves against the sky."""
+    spots = [spots_at(frame.pixels(frame.number * velocity[None] + 100.0), 10) for frame in frames]
+    hits = [Hit.of_all(frame, spot)[0] for frame, spot in zip(frames, spots, strict=True)]
+    track = Track(-20.0, 1.0, {hit.number: hit for hit in hits}, track_id=1)
+    track.fit()
+    return track
+
+
+@pytest.mark.parametrize("kept", [8, 3, 1])
+def test_a_track_goes_with_its_frames(kept):
+    """The sky is shifted by a pixel a frame, and turned about its newest frame."""
+    velocity = np.array([5.0, 1.0])
+    frames = [frame_of(number, SIDE) for number in range(8)]
+    track = track_of(frames, velocity)
+    before = np.sqrt(predict([track], frames[-1].stamp_ns)[1][0][0, 0])
+    moved = {}
+    for frame in frames[-kept:]:
+        shift = np.eye(3)
+        shift[:2, 2] = (10.0 + frame.number, 4.0)
+        moved[frame.number] = replace(frame, to_sky=shift)
+    track.see_in(moved)
+    (state,), (covariance,) = predict([track], frames[-1].stamp_ns)
+    assert state[:2] == pytest.approx(7 * velocity + 100 + (17.0, 4.0), abs=0.1)
+    # One hit tells no velocity: what was known of it stays.
+    assert state[2:] == pytest.approx(velocity + ((1, 0) if kept > 1 else (0, 0)), abs=0.1)
+    assert np.sqrt(covariance[0, 0]) < 2 * before
+    assert len(track.hits) == track.hit_count == 8
+
+
+def test_a_track_of_other_frames_is_no_path():
+    history = history_of([path(np.array([130.0, 120.0]))])
+    frames = [frame_of(number, SIDE) for number in range(-8, 0)]
+    tracker = Tracker(lambda *_: spots_at([], 1), lambda *_: spots_at([], 1))
+    tracker._tracks = [track_of(frames, np.array([5.0, 1.0])), track_of(list(history), STARS[0])]
+    assert len(tracker.paths(history).rows) == 1
+
+
 # In the pipeline
 
 
-def pass_of(settings: SimulatorSettings):
+def pass_of(settings: SimulatorSettings, **parameters: int):
     """Rows found and missed of the RSOs, false ones, and errors of the field's motion, px."""
-    pipeline, truth, settled, motions = Pipeline(), [], [], []
+    pipeline, truth, settled, motions = Pipeline(Parameters(**parameters)), [], [], []
     for frame in SkySimulator(settings):
         result = pipeline.process(frame.image, frame.stamp_ns)
         truth.append(frame.truth)
@@ -256,6 +363,14 @@ def test_a_bright_rso_that_drifts_among_few_stars_is_found_and_the_stars_are_not
     assert (found, false) == (of, 0)
     # Stars of SNR 5 to 10, two to four of them: 0.2 px each, and what is alike in them.
     assert np.median(off) < 0.5
+
+
+@pytest.mark.parametrize("history_frames", [3, 4])
+def test_tracks_outlive_a_short_history(history_frames):
+    """They coast for twice as long as it holds frames."""
+    settings = replace(SPARSE, rsos=(RSO((181.0, 180.0), (3.0, 2.2), snr=45),), seed=5)
+    found, of, _, _ = pass_of(settings, history_frames=history_frames, coast_frames=8)
+    assert found >= 0.8 * of
 
 
 def test_stars_that_streak_past_two_rsos_that_are_followed_are_not_tracks():

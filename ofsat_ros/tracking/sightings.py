@@ -233,6 +233,9 @@ class Sighting:
         """Return the same with its frame at another place on the sky."""
         other = Sighting.of(frame, self.spots, before)
         other.free[:] = self.free
+        if before is None:
+            # The frame that told what is repeated has left.
+            other.telling[:] = self.telling
         return other
 
     @cached_property

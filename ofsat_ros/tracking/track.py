@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import mul
 from statistics import median
@@ -31,6 +31,8 @@ _FLOOR_PX = 0.05
 _REFINED_SPREAD = 0.01
 # Hits over which a velocity is fitted, and over which a track must have moved.
 _FIT_HITS, _WAY_HITS = 9, 5
+# So many tell a velocity from errors.
+_LEAST_HITS = 3
 # What stays within this way on the sky is a star, px; nor is it motion if it may be chance.
 _LEAST_WAY_PX, _WAY_SIGMAS = 1.0, 4.0
 # Logarithm of how much less likely a miss makes a track, and a hit after its birth more.
@@ -160,14 +162,28 @@ class Track:
             _update([self], [hit])
 
     def see_in(self, frames: Mapping[int, PastFrame]) -> None:
-        """Take its hits to where frames of their numbers are now, and filter them again."""
+        """Take its hits to where frames of their numbers are now, and filter them again.
+
+        Hits of other frames go with the nearest of those.
+        """
         known = {n: Hit.of(frames[n], hit.spot) for n, hit in self.hits.items() if n in frames}
         if not known:
             return
-        count, born = self.hit_count, (self.born_hits, self.born_ns)
-        self.hits = known
-        self.fit()
-        self.hit_count, (self.born_hits, self.born_ns) = count, born
+        way = {n: hit.sky - self.hits[n].sky for n, hit in known.items()}
+        others = {
+            n: replace(hit, sky=hit.sky + way[min(way)])
+            for n, hit in self.hits.items()
+            if n not in known
+        }
+        if len(known) < _LEAST_HITS:
+            # Too few tell the velocity.
+            self.state[:2] += way[max(way)]
+        else:
+            kept = self.hit_count, self.born_hits, self.born_ns
+            self.hits = known
+            self.fit()
+            self.hit_count, self.born_hits, self.born_ns = kept
+        self.hits = {**others, **known}
 
     def go_on_from(self, before: Track) -> None:
         """Be the same RSO as a track that has ended; where both have a hit, its own counts."""
@@ -272,7 +288,7 @@ def paths_of(tracks: Sequence[Track], frames: Sequence[PastFrame]) -> Paths:
         for column, frame in enumerate(frames):
             if (hit := track.hits.get(frame.number)) is not None:
                 at = row, column
-                rows[at], variance[at] = 0, np.trace(hit.covariance) / 2
+                rows[at], variance[at] = row, np.trace(hit.covariance) / 2
                 sky[at], image[at] = complex(*hit.sky), complex(*hit.xy)
     times = np.array([frame.seconds_since(frames[0]) for frame in frames])
     return Paths(times, rows, sky, image, variance)

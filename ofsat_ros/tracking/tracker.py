@@ -121,10 +121,11 @@ class Tracker:
 
     def paths(self, history: History) -> Paths:
         """Where the tracks that were seen for a while were in a history's frames."""
-        return paths_of(self._seen_for_a_while(), list(history)[::-1])
+        return paths_of(self._seen_for_a_while(history), list(history)[::-1])
 
-    def _seen_for_a_while(self) -> list[Track]:
-        return [track for track in self._tracks if len(track.hits) >= _RATE_HITS]
+    def _seen_for_a_while(self, history: History) -> list[Track]:
+        numbers = {frame.number for frame in history}
+        return [t for t in self._tracks if len(t.hits.keys() & numbers) >= _RATE_HITS]
 
     def straighten(
         self, history: History, stars: Array, followed: Sequence[int] | NDArray[np.intp]
@@ -135,7 +136,7 @@ class Tracker:
         are at the places `stars`, (N, 2) px in the newest frame, and those of the rows `followed`
         of `paths`.
         """
-        gone = {self._seen_for_a_while()[row].track_id for row in followed}
+        gone = {self._seen_for_a_while(history)[row].track_id for row in followed}
         frames = {frame.number: frame for frame in history}
         for track in (*self._tracks, *self._ended):
             track.see_in(frames)
