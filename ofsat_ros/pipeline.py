@@ -351,7 +351,9 @@ class Pipeline:
             strays = np.unique(result.flow.object_index[before.leads_astray(result.flow)])
             return replace(current, strays=strays[strays >= 0]), []
         stamps = [frame.stamp_ns for frame in self._history]
-        if comoving.to_sky is not None and before.stamp_ns in stamps:
+        if before.stamp_ns not in stamps:
+            return current, []
+        if comoving.to_sky is not None:
             history, motion, flow = self._history, result.star_field, result.flow
             history.straighten(comoving.to_sky)
             stars = positions(result.objects)[comoving.stars]
