@@ -17,6 +17,7 @@ from ofsat_ros.pipeline import Pipeline
 from ofsat_ros.simulation import RSO, SimulatorSettings, SkySimulator
 from ofsat_ros.star_field import _mean_motion
 from ofsat_ros.tracking import Tracker
+from ofsat_ros.tracking.sightings import Sighting
 from ofsat_ros.tracking.track import Hit, Track, predict
 
 FRAMES, SIDE = 9, 256
@@ -303,6 +304,20 @@ def test_a_track_goes_with_its_frames(kept):
     assert state[2:] == pytest.approx(velocity + ((1, 0) if kept > 1 else (0, 0)), abs=0.1)
     assert np.sqrt(covariance[0, 0]) < 2 * before
     assert len(track.hits) == track.hit_count == 8
+
+
+def test_what_a_wrong_fit_and_a_frame_that_left_told_is_not_asked_again():
+    """The scatter was that about the old motion; what is repeated stays known."""
+    history = History(2)
+    for number in range(2):
+        history.add(replace(frame_of(number, SIDE), scatter=8.0))
+    history.straighten([np.eye(3), np.eye(3)])
+    assert [frame.scatter for frame in history] == [1.0, 1.0]
+    spots = spots_at([(50.0, 50.0), (90.0, 40.0)], 10)
+    before = Sighting.of(history[0], spots[:1])
+    repeated = Sighting.of(history[1], spots, before)
+    assert repeated.telling.tolist() == [False, True]
+    assert repeated.seen_in(history[1], None).telling.tolist() == [False, True]
 
 
 def test_a_track_of_other_frames_is_no_path():
